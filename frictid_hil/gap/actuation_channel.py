@@ -246,19 +246,12 @@ def _generic(logs: Sequence[Recording], base: Sequence[Array]) -> dict[str, list
 
 @dataclass(frozen=True, slots=True)
 class _Drive:
-    """What a drive is asked for in one recording, at every tick of its controller.
+    """What a drive is asked for in one recording, at every tick of its controller."""
 
-    Attributes:
-        recording: its rows.
-        demand_nm: at every tick, shape (n * ticks,).
-        ticks: of the controller to a row.
-        limit_nm: of the torque.
-    """
-
-    recording: Recording
-    demand_nm: Array
-    ticks: int
-    limit_nm: float
+    recording: Recording  # its rows
+    demand_nm: Array  # at every tick, shape (n * ticks,)
+    ticks: int  # of the controller to a row
+    limit_nm: float  # of the torque
 
     @staticmethod
     def of(recording: Recording, nominal: Nominal, limit_nm: float, *, as_reported: bool = False) -> _Drive:

@@ -22,104 +22,64 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.robot_model import RobotModel, inverse_torque
 
-Rows = list[list[NDArray[np.intp]]]
-"""Rows that count, by recording and joint."""
-Motion = tuple[Array, Array, Array]
-"""Position, velocity and acceleration, (n, k) each."""
+Rows = list[list[NDArray[np.intp]]]  # rows that count, by recording and joint
+Motion = tuple[Array, Array, Array]  # position, velocity and acceleration, (n, k) each
 
 CUTOFF_HZ = 15.0
-RATE_HZ = 60.0
-"""Rate to which everything is thinned behind the low-pass."""
-MOVING = 0.06
-"""Share of a joint's fastest speed above which its friction is that of sliding."""
-MASS_PRIOR = 0.3
-"""One-sigma of the share by which a link may be heavier or lighter when that is a cause."""
-PAYLOAD_PRIOR = 0.3
-"""One-sigma of a payload's mass, over the mass of all links."""
-REACH_PRIOR_M = 0.15
-"""One-sigma of the place of a payload's centre."""
+RATE_HZ = 60.0  # rate to which everything is thinned behind the low-pass
+MOVING = 0.06  # share of a joint's fastest speed above which its friction is that of sliding
+MASS_PRIOR = 0.3  # one-sigma of the share by which a link may be heavier or lighter when that is a cause
+PAYLOAD_PRIOR = 0.3  # one-sigma of a payload's mass, over the mass of all links
+REACH_PRIOR_M = 0.15  # one-sigma of the place of a payload's centre
 TILT_PRIOR_RAD = 0.1
-REGRASPED = 2
-"""Times that a payload's centre is found anew from where it was found."""
-LIGHTEST = 0.005
-"""Mass of a payload, over that of all links, from which its centre is looked for."""
-SURE = 0.9
-"""Chance from which a cause of the arm is named."""
-LEAST_GAIN = 0.02
-"""Fall of the pooled RMS on logs that were not fitted, below which a cause has no practical meaning."""
+REGRASPED = 2  # times that a payload's centre is found anew from where it was found
+LIGHTEST = 0.005  # mass of a payload, over that of all links, from which its centre is looked for
+SURE = 0.9  # chance from which a cause of the arm is named
+LEAST_GAIN = 0.02  # fall of the pooled RMS on logs that were not fitted, below which a cause has no practical meaning
 _ROTOR_KG_M2 = 100.0
-NEGLIGIBLE = 1e-6
-"""Share of the largest pivot below which a combination of parameters is not seen at all."""
+NEGLIGIBLE = 1e-6  # share of the largest pivot below which a combination of parameters is not seen at all
 
 
 @dataclass(frozen=True, slots=True)
 class ArmCause:
-    """A cause of the arm.
+    """A cause of the arm."""
 
-    Attributes:
-        effect: ``payload``, ``link_mass_error`` or ``base_orientation_error``.
-        body: that carries it; empty for the base.
-        confidence: chance that it is this one.
-        parameters: value and 95 % interval, by name with unit.
-    """
-
-    effect: str
-    body: str
-    confidence: float
-    parameters: Mapping[str, tuple[float, float, float]]
+    effect: str  # ``payload``, ``link_mass_error`` or ``base_orientation_error``
+    body: str  # that carries it; empty for the base
+    confidence: float  # chance that it is this one
+    parameters: Mapping[str, tuple[float, float, float]]  # value and 95 % interval, by name with unit
 
 
 @dataclass(frozen=True, slots=True)
 class BaseParameters:
-    """What these motions can tell of the bodies at all.
+    """What these motions can tell of the bodies at all."""
 
-    Attributes:
-        columns: inertial parameters of all bodies.
-        rank: combinations of them that move any torque (base parameters).
-        condition: of the base parameters' columns, scaled to equal length.
-    """
-
-    columns: int
-    rank: int
-    condition: float
+    columns: int  # inertial parameters of all bodies
+    rank: int  # combinations of them that move any torque (base parameters)
+    condition: float  # of the base parameters' columns, scaled to equal length
 
 
 @dataclass(frozen=True, slots=True)
 class ArmFindings:
-    """What was found of the arm.
+    """What was found of the arm."""
 
-    Attributes:
-        cause: named one, or None.
-        chances: of each candidate, ``none`` among them, by name.
-        rms_before: pooled over joints on logs that were not fitted, torque over each joint's dry friction.
-        rms_after: with the cause.
-        base: identifiability.
-        torque: (position, velocity, acceleration) of the arm, (n, k) each -> torque to add to the model's, (n, k).
-    """
-
-    cause: ArmCause | None
-    chances: Mapping[str, float]
-    rms_before: float
-    rms_after: float
-    base: BaseParameters
+    cause: ArmCause | None  # named one, or None
+    chances: Mapping[str, float]  # of each candidate, ``none`` among them, by name
+    rms_before: float  # pooled over joints on logs that were not fitted, torque over each joint's dry friction
+    rms_after: float  # with the cause
+    base: BaseParameters  # identifiability
+    # (position, velocity, acceleration) of the arm, (n, k) each -> torque to add to the model's, (n, k).
     torque: Callable[[Array, Array, Array], Array] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """One recording of the arm; arrays (n, k).
+    """One recording of the arm; arrays (n, k)."""
 
-    Attributes:
-        validation: judged on, never fitted.
-        time_s: shape (n,).
-        position_rad: measured.
-        torque_nm: measured.
-    """
-
-    validation: bool
-    time_s: Array
-    position_rad: Array
-    torque_nm: Array
+    validation: bool  # judged on, never fitted
+    time_s: Array  # shape (n,)
+    position_rad: Array  # measured
+    torque_nm: Array  # measured
 
 
 @dataclass(frozen=True, slots=True)

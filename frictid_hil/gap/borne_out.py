@@ -17,27 +17,20 @@ from frictid_hil.simulation.effects import all_effects
 
 FACTORS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 """Factors of a parameter that are tried where a motion alone could not tell it."""
-REFUTED = 0.4
-"""Most that is claimed of a cause that the closed loop does not bear out."""
+REFUTED = 0.4  # most that is claimed of a cause that the closed loop does not bear out
 LITTLE = "closed loop: most of its gap stays"
 NO_NEARER = "closed loop: what describes the torque along the motion brings the simulated joint no nearer"
 
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """The closed loop of one set.
+    """The closed loop of one set."""
 
-    Attributes:
-        gap_nm: RMS of its torque gap with effects added to the believed joint; infinite where it runs away.
-        before_nm: the same with none.
-        floor_nm: RMS that noise alone leaves of it.
-        negligible_nm: gap that means nothing to the user.
-    """
-
+    # RMS of its torque gap with effects added to the believed joint; infinite where it runs away.
     gap_nm: Callable[[Effects], float]
-    before_nm: float
-    floor_nm: float
-    negligible_nm: float = 0.0
+    before_nm: float  # the same with none
+    floor_nm: float  # RMS that noise alone leaves of it
+    negligible_nm: float = 0.0  # gap that means nothing to the user
 
     @property
     def visible(self) -> float:

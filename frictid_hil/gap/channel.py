@@ -16,85 +16,52 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import Shape
 
-FAMILY = "family "
-"""Prefix of generic functions: they compete like a cause, and have no name that anybody could repair."""
+FAMILY = "family "  # prefix of generic functions: they compete like a cause, and have no name that anybody could repair
 
-STIFFNESS = "stiffness"
-"""Shape of the term that is an error of a stated presliding stiffness."""
+STIFFNESS = "stiffness"  # shape of the term that is an error of a stated presliding stiffness
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """A way in which one cause can show in a channel: columns, and what is believed of their coefficients.
+    """A way in which one cause can show in a channel: columns, and what is believed of their coefficients."""
 
-    Attributes:
-        effect: the cause; empty for what has no name (timing, a rigid-body column that is off as a whole).
-        shape: the cause's nonlinear parameters.
-        columns: numbers of its columns in the channel's table.
-        mean: of the coefficients before anything is recorded, shape (k,).
-        deviation: one-sigma of the same, shape (k,).
-        least: of the first coefficient; below, it is another effect.
-        largest: of the first coefficient.
-    """
-
-    effect: str
-    shape: Shape
-    columns: tuple[int, ...]
-    mean: Array
-    deviation: Array
-    least: float = -math.inf
-    largest: float = math.inf
+    effect: str  # the cause; empty for what has no name (timing, a rigid-body column that is off as a whole)
+    shape: Shape  # the cause's nonlinear parameters
+    columns: tuple[int, ...]  # numbers of its columns in the channel's table
+    mean: Array  # of the coefficients before anything is recorded, shape (k,)
+    deviation: Array  # one-sigma of the same, shape (k,)
+    least: float = -math.inf  # of the first coefficient; below, it is another effect
+    largest: float = math.inf  # of the first coefficient
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """One log, low-passed and thinned.
+    """One log, low-passed and thinned."""
 
-    Attributes:
-        name: of the experiment.
-        validation: judged on, not fitted.
-        start_s: time of its first row in the log.
-        y: the residual, shape (n,).
-        x: every column of the channel, shape (n, m).
-        known_noise: a sample of that part of y's noise which is known beforehand, shape (n,).
-        told: rows that tell something of the joint; in the others that noise is too strong. Shape (n,).
-    """
-
-    name: str
-    validation: bool
-    start_s: float
-    y: Array
-    x: Array
-    known_noise: Array
-    told: np.ndarray
+    name: str  # of the experiment
+    validation: bool  # judged on, not fitted
+    start_s: float  # time of its first row in the log
+    y: Array  # the residual, shape (n,)
+    x: Array  # every column of the channel, shape (n, m)
+    known_noise: Array  # a sample of that part of y's noise which is known beforehand, shape (n,)
+    told: np.ndarray  # rows that tell something of the joint; in the others that noise is too strong. Shape (n,).
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A channel of one set.
+    """A channel of one set."""
 
-    Attributes:
-        name: ``plant``, ``actuation`` or ``tracking``.
-        step_s: of the rows.
-        logs: in run order.
-        nuisances: what the belief may be wrong by within its tolerance; always in.
-        candidates: what may be there besides.
-        scale: what a cause may well make of y, in its unit.
-        cutoff_hz: of the low-pass that all columns have passed.
-        raw: RMS of the residual before the low-pass on the validation logs, and what noise leaves of it.
-        known_floor: RMS behind the low-pass of what is known to be noise, whatever any model leaves.
-        between_rows: the controller was replayed between rows of the logs or on an uneven clock, so not exactly.
-    """
-
-    name: str
-    step_s: float
-    logs: tuple[Rows, ...]
-    nuisances: tuple[Term, ...]
-    candidates: tuple[Term, ...]
-    scale: float
-    cutoff_hz: float
+    name: str  # ``plant``, ``actuation`` or ``tracking``
+    step_s: float  # of the rows
+    logs: tuple[Rows, ...]  # in run order
+    nuisances: tuple[Term, ...]  # what the belief may be wrong by within its tolerance; always in
+    candidates: tuple[Term, ...]  # what may be there besides
+    scale: float  # what a cause may well make of y, in its unit
+    cutoff_hz: float  # of the low-pass that all columns have passed
+    # RMS of the residual before the low-pass on the validation logs, and what noise leaves of it.
     raw: tuple[float, float] = (0.0, 0.0)
-    known_floor: float = math.inf
+    known_floor: float = math.inf  # RMS behind the low-pass of what is known to be noise, whatever any model leaves
+    # The controller was replayed between rows of the logs or on an uneven clock, so not exactly.
     between_rows: bool = False
 
     @property
@@ -110,15 +77,10 @@ class Channel:
 
 @dataclass
 class Builder:
-    """Collects columns log by log, and hands out their numbers.
+    """Collects columns log by log, and hands out their numbers."""
 
-    Attributes:
-        parts: per log, blocks of columns of shape (n, k).
-        width: columns so far.
-    """
-
-    parts: list[list[Array]]
-    width: int = 0
+    parts: list[list[Array]]  # per log, blocks of columns of shape (n, k)
+    width: int = 0  # columns so far
 
     def add(self, columns: Sequence[Array]) -> tuple[int, ...]:
         """Take in one block of columns per log; their numbers."""

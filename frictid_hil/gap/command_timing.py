@@ -15,8 +15,7 @@ from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet
 from frictid_hil.gap.forward import Replay, why_not
 from frictid_hil.gap.residuals import LowPass, demand_of, held, uniform
 
-FASTEST = 1.05
-"""Rows of the log to a control tick, above which it holds what the controller never saw."""
+FASTEST = 1.05  # rows of the log to a control tick, above which it holds what the controller never saw
 
 
 def between_rows(controller: Controller | None, step_s: float) -> bool:

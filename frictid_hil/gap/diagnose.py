@@ -40,12 +40,9 @@ NEGLIGIBLE = 0.05
 """Gap that means nothing in practice, over the friction level: friction repeats to about this from day to day."""
 LOUD = 3.0
 """Gap of the closed loop over white noise, above which it is no noise: a slow part eight times as strong in power."""
-READ = 0.97
-"""Chance of what is read from reported positions and velocities themselves."""
-TIED = 0.45
-"""Chance of each of two causes that a motion makes alike, a little left for a third."""
-UNDECIDED = 0.5
-"""Most that is claimed of causes that a motion or the lack of a second log cannot tell apart."""
+READ = 0.97  # chance of what is read from reported positions and velocities themselves
+TIED = 0.45  # chance of each of two causes that a motion makes alike, a little left for a third
+UNDECIDED = 0.5  # most that is claimed of causes that a motion or the lack of a second log cannot tell apart
 
 
 def diagnose(

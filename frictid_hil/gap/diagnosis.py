@@ -23,21 +23,14 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """One effect that explains a part of the gap.
+    """One effect that explains a part of the gap."""
 
-    Attributes:
-        effect: name.
-        confidence: calibrated chance that this effect is really there, 0..1.
-        parameters: by name with unit; empty for an alternative that was not taken.
-        confusable_with: effects that this recording can hardly tell from it.
-        gap_closed_percent: its own part of what closing the gap achieved, or None.
-    """
-
-    effect: str
-    confidence: float
+    effect: str  # name
+    confidence: float  # calibrated chance that this effect is really there, 0..1
+    # By name with unit; empty for an alternative that was not taken.
     parameters: Mapping[str, Value] = field(default_factory=dict)
-    confusable_with: tuple[str, ...] = ()
-    gap_closed_percent: float | None = None
+    confusable_with: tuple[str, ...] = ()  # effects that this recording can hardly tell from it
+    gap_closed_percent: float | None = None  # its own part of what closing the gap achieved, or None
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,17 +53,11 @@ class Figures:
 
 @dataclass(frozen=True, slots=True)
 class Raw:
-    """The inverse gap before any filter, on validation logs, N m.
+    """The inverse gap before any filter, on validation logs, N m."""
 
-    Attributes:
-        inverse_nm: RMS of the residual.
-        noise_floor_nm: what noise of torque and position leaves of it.
-        cutoff_hz: of the low-pass behind which all other figures are formed.
-    """
-
-    inverse_nm: float
-    noise_floor_nm: float
-    cutoff_hz: float
+    inverse_nm: float  # RMS of the residual
+    noise_floor_nm: float  # what noise of torque and position leaves of it
+    cutoff_hz: float  # of the low-pass behind which all other figures are formed
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,45 +72,29 @@ class NextExperiment:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """Where the gap lies, what causes it, how far it closes.
+    """Where the gap lies, what causes it, how far it closes."""
 
-    Attributes:
-        name: of the experiment set.
-        verdict: ``none``, ``explained``, ``ambiguous`` or ``unknown``.
-        causes: ranked, the likeliest first.
-        where: shares of the gap.
-        before: gap of the nominal joint.
-        after: gap with the causes added.
-        noise_floor: what noise alone leaves.
-        per_log: before and after by validation log.
-        next_experiment: where the verdict is ambiguous.
-        reasons: why a figure is None, or what could not be concluded, by subject.
-        summary: one sentence.
-        model: the joint with its causes added, where the closed loop can be simulated.
-        candidate: the joint with the likeliest causes added, whatever the verdict; for who asks for it all the same.
-        held_out: by effect, change of the held-out squares when it alone is added, percent.
-        raw: the gap before any filter; None where it is not formed.
-        samples: draws of the posterior, parameters by effect; empty where nothing was sampled.
-        presliding_nm_per_rad: stiffness at the believed level that the recordings were compared with; None where no
-            stiffness is believed.
-    """
-
-    name: str
-    verdict: str
-    causes: tuple[Cause, ...]
-    where: tuple[Where, ...]
-    before: Figures
-    after: Figures
-    noise_floor: Figures
-    per_log: Mapping[str, Mapping[str, Figures]] = field(default_factory=dict)
-    next_experiment: NextExperiment | None = None
+    name: str  # of the experiment set
+    verdict: str  # ``none``, ``explained``, ``ambiguous`` or ``unknown``
+    causes: tuple[Cause, ...]  # ranked, the likeliest first
+    where: tuple[Where, ...]  # shares of the gap
+    before: Figures  # gap of the nominal joint
+    after: Figures  # gap with the causes added
+    noise_floor: Figures  # what noise alone leaves
+    per_log: Mapping[str, Mapping[str, Figures]] = field(default_factory=dict)  # before and after by validation log
+    next_experiment: NextExperiment | None = None  # where the verdict is ambiguous
+    # Why a figure is None, or what could not be concluded, by subject.
     reasons: Mapping[str, str] = field(default_factory=dict)
-    summary: str = ""
-    model: JointModel | None = None
+    summary: str = ""  # one sentence
+    model: JointModel | None = None  # the joint with its causes added, where the closed loop can be simulated
+    # The joint with the likeliest causes added, whatever the verdict; for who asks for it all the same.
     candidate: JointModel | None = None
+    # By effect, change of the held-out squares when it alone is added, percent.
     held_out: Mapping[str, float] = field(default_factory=dict)
-    raw: Raw | None = None
+    raw: Raw | None = None  # the gap before any filter; None where it is not formed
+    # Draws of the posterior, parameters by effect; empty where nothing was sampled.
     samples: tuple[Mapping[str, Mapping[str, float]], ...] = ()
+    # Stiffness at the believed level that the recordings were compared with; None where no stiffness is believed.
     presliding_nm_per_rad: float | None = None
 
     def improved_model(self) -> JointModel | None:

@@ -27,16 +27,12 @@ from frictid_hil.recording.csv import read_csv
 from frictid_hil.recording.samples import Samples
 from frictid_hil.simulation.effects import all_effects
 
-MAX_ROWS = 2_000_000
-"""Rows of one log that are read; a longer one is refused with advice, not quietly cut."""
+MAX_ROWS = 2_000_000  # rows of one log that are read; a longer one is refused with advice, not quietly cut
 
 
-REST_SHARE = 1e-4
-"""A log whose travel is below this share of the longest one shows a joint at rest."""
-LONG_GAP_S = 0.25
-"""A gap from which a recording goes on as another log: nobody knows what the joint did meanwhile."""
-LEAST_PIECE_ROWS = 200
-"""Shorter pieces between gaps are left out."""
+REST_SHARE = 1e-4  # a log whose travel is below this share of the longest one shows a joint at rest
+LONG_GAP_S = 0.25  # a gap from which a recording goes on as another log: nobody knows what the joint did meanwhile
+LEAST_PIECE_ROWS = 200  # shorter pieces between gaps are left out
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,31 +52,19 @@ class Controller:
 
     ``kp*(b*command - q) + integral(ki*(command - q)) + kd*(c*dcommand/dt - filtered velocity) + feedforward``. A PID
     has b = c = 1; a cascade kv (kp e - v), with or without an integral, is the same law with other weights.
-
-    Attributes:
-        rate_hz: control rate.
-        kp_nm_per_rad: proportional gain.
-        ki_nm_per_rad_s: integral gain; the integral freezes while the limit is active.
-        kd_nm_s_per_rad: gain on the velocity error.
-        velocity_filter_s: time constant of the velocity's first-order filter.
-        torque_limit_nm: limit of the demand.
-        command_rate: how dcommand/dt is formed, ``central`` or ``backward`` (a drive that follows set-points as they
-            come).
-        command_weight: b.
-        command_rate_weight: c.
-        feedforward: None where there is none.
     """
 
-    rate_hz: float
-    kp_nm_per_rad: float
-    ki_nm_per_rad_s: float
-    kd_nm_s_per_rad: float
-    velocity_filter_s: float = 0.0
-    torque_limit_nm: float = float("inf")
+    rate_hz: float  # control rate
+    kp_nm_per_rad: float  # proportional gain
+    ki_nm_per_rad_s: float  # integral gain; the integral freezes while the limit is active
+    kd_nm_s_per_rad: float  # gain on the velocity error
+    velocity_filter_s: float = 0.0  # time constant of the velocity's first-order filter
+    torque_limit_nm: float = float("inf")  # limit of the demand
+    # How dcommand/dt is formed, ``central`` or ``backward`` (a drive that follows set-points as they come).
     command_rate: str = "central"
-    command_weight: float = 1.0
-    command_rate_weight: float = 1.0
-    feedforward: FeedForward | None = None
+    command_weight: float = 1.0  # b
+    command_rate_weight: float = 1.0  # c
+    feedforward: FeedForward | None = None  # None where there is none
 
     def added_nm(self, command_rad: Array, step_s: float) -> Array:
         """What the law adds to a plain PID because of its command's weight and its feed-forward, shape (n,)."""
@@ -111,82 +95,48 @@ class Payload:
 
 @dataclass(frozen=True, slots=True)
 class Nominal:
-    """What the simulator believes. None: it does not say.
+    """What the simulator believes. None: it does not say."""
 
-    Attributes:
-        inertia_kg_m2: of the whole joint, motor included.
-        motor_inertia_share: motor's part of it, 0..1.
-        gravity_cos_nm: gravity torque is ``gravity_cos*cos(q) + gravity_sin*sin(q)``.
-        gravity_sin_nm: see there.
-        gear_ratio: motor turns per joint turn.
-        curve: friction over speed.
-        presliding_stiffness_nm_per_rad: of the friction's spring before it slips.
-        yields_gradually: friction builds up as Dahl's and the LuGre model, and not as a spring that slips.
-        payload: what is mounted where an experiment says so.
-        controller: of the position loop.
-        rated_torque_nm: of the drive, joint side.
-        torque_quantum_nm: step of the reported torque.
-        torque_report_filter: declared low-pass of the reported torque; None where none is declared.
-        believed_effects: what the file already says of the drive (its delay, its current loop), as effects by name.
-        encoder_resolution_rad: step of the reported position, joint side.
-        velocity_filter_s: known time constant of the reported velocity.
-        continuous: the joint may turn on and on.
-        tolerances: one-sigma of every number.
-        document: the whole file, for writing an improved one.
-    """
-
-    inertia_kg_m2: float | None = None
-    motor_inertia_share: float | None = None
-    gravity_cos_nm: float = 0.0
+    inertia_kg_m2: float | None = None  # of the whole joint, motor included
+    motor_inertia_share: float | None = None  # motor's part of it, 0..1
+    gravity_cos_nm: float = 0.0  # gravity torque is ``gravity_cos*cos(q) + gravity_sin*sin(q)``
     gravity_sin_nm: float = 0.0
-    gear_ratio: float | None = None
-    curve: FrictionCurve | None = None
-    presliding_stiffness_nm_per_rad: float | None = None
+    gear_ratio: float | None = None  # motor turns per joint turn
+    curve: FrictionCurve | None = None  # friction over speed
+    presliding_stiffness_nm_per_rad: float | None = None  # of the friction's spring before it slips
+    # Friction builds up as Dahl's and the LuGre model, and not as a spring that slips.
     yields_gradually: bool | None = None
-    payload: Payload | None = None
-    controller: Controller | None = None
-    rated_torque_nm: float | None = None
-    torque_quantum_nm: float | None = None
+    payload: Payload | None = None  # what is mounted where an experiment says so
+    controller: Controller | None = None  # of the position loop
+    rated_torque_nm: float | None = None  # of the drive, joint side
+    torque_quantum_nm: float | None = None  # step of the reported torque
+    # Declared low-pass of the reported torque; None where none is declared.
     torque_report_filter: ReportFilter | None = None
+    # What the file already says of the drive (its delay, its current loop), as effects by name.
     believed_effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    encoder_resolution_rad: float | None = None
-    velocity_filter_s: float = 0.0
-    continuous: bool = False
-    tolerances: Tolerances = field(default_factory=Tolerances.of)
-    document: Mapping[str, Any] | None = None
+    encoder_resolution_rad: float | None = None  # step of the reported position, joint side
+    velocity_filter_s: float = 0.0  # known time constant of the reported velocity
+    continuous: bool = False  # the joint may turn on and on
+    tolerances: Tolerances = field(default_factory=Tolerances.of)  # one-sigma of every number
+    document: Mapping[str, Any] | None = None  # the whole file, for writing an improved one
 
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """One recording with its part in the diagnosis; columns have shape (n,), absent ones are None.
+    """One recording with its part in the diagnosis; columns have shape (n,), absent ones are None."""
 
-    Attributes:
-        name: of the experiment.
-        validation: judged on, never fitted.
-        payload: the payload was mounted.
-        run_order: place in time among the experiments (temperature carries over).
-        time_s: strictly increasing.
-        position_rad: measured.
-        velocity_rad_s: the drive's own.
-        torque_nm: the drive's own.
-        position_command_rad: commanded.
-        rigid_body_torque_nm: the part that the user's own rigid-body model explains.
-        temperature_c: of motor or gear.
-        torque_demand_nm: the controller's own demand, where the log brings it.
-    """
-
-    name: str
-    validation: bool
-    payload: bool
-    run_order: int
-    time_s: Array
-    position_rad: Array
-    velocity_rad_s: Array | None = None
-    torque_nm: Array | None = None
-    position_command_rad: Array | None = None
-    rigid_body_torque_nm: Array | None = None
-    temperature_c: Array | None = None
-    torque_demand_nm: Array | None = None
+    name: str  # of the experiment
+    validation: bool  # judged on, never fitted
+    payload: bool  # the payload was mounted
+    run_order: int  # place in time among the experiments (temperature carries over)
+    time_s: Array  # strictly increasing
+    position_rad: Array  # measured
+    velocity_rad_s: Array | None = None  # the drive's own
+    torque_nm: Array | None = None  # the drive's own
+    position_command_rad: Array | None = None  # commanded
+    rigid_body_torque_nm: Array | None = None  # the part that the user's own rigid-body model explains
+    temperature_c: Array | None = None  # of motor or gear
+    torque_demand_nm: Array | None = None  # the controller's own demand, where the log brings it
 
     @property
     def travel_rad(self) -> float:
@@ -196,19 +146,12 @@ class Experiment:
 
 @dataclass(frozen=True, slots=True)
 class ExperimentSet:
-    """Nominal joint and its experiments, in run order.
+    """Nominal joint and its experiments, in run order."""
 
-    Attributes:
-        name: of the set.
-        nominal: the believed joint.
-        experiments: logs in which the joint moves.
-        at_rest: names of logs in which it does not; they say nothing of friction and are left out.
-    """
-
-    name: str
-    nominal: Nominal
-    experiments: tuple[Experiment, ...]
-    at_rest: tuple[str, ...] = ()
+    name: str  # of the set
+    nominal: Nominal  # the believed joint
+    experiments: tuple[Experiment, ...]  # logs in which the joint moves
+    at_rest: tuple[str, ...] = ()  # names of logs in which it does not; they say nothing of friction and are left out
 
     @staticmethod
     def load(folder: Path) -> ExperimentSet:

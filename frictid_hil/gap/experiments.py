@@ -42,29 +42,17 @@ SHORT = ("triangle_slow", "chirp", "breakaway", "sines_payload", "moves_payload"
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """Where and how fast a joint may move for its diagnosis.
+    """Where and how fast a joint may move for its diagnosis."""
 
-    Attributes:
-        centre_rad: middle of every travel.
-        travel_rad: peak-to-peak travel of the small sines; the large ones travel twice as far.
-        velocity_rad_s: peak speed of the sines.
-        triangle_rad: half travel of the slow triangle.
-        triangle_velocity_rad_s: its constant speed.
-        creep_velocity_rad_s: speed of the break-away's creep.
-        chirp_velocity_rad_s: speed amplitude of the chirp.
-        chirp_high_hz: its last frequency.
-        second_centre_rad: middle of the second posture, or None where the joint has no room for one.
-    """
-
-    centre_rad: float
-    travel_rad: float
-    velocity_rad_s: float
-    triangle_rad: float = 0.5
-    triangle_velocity_rad_s: float = 0.1
-    creep_velocity_rad_s: float = 0.012
-    chirp_velocity_rad_s: float = 0.35
-    chirp_high_hz: float = 8.0
-    second_centre_rad: float | None = None
+    centre_rad: float  # middle of every travel
+    travel_rad: float  # peak-to-peak travel of the small sines; the large ones travel twice as far
+    velocity_rad_s: float  # peak speed of the sines
+    triangle_rad: float = 0.5  # half travel of the slow triangle
+    triangle_velocity_rad_s: float = 0.1  # its constant speed
+    creep_velocity_rad_s: float = 0.012  # speed of the break-away's creep
+    chirp_velocity_rad_s: float = 0.35  # speed amplitude of the chirp
+    chirp_high_hz: float = 8.0  # its last frequency
+    second_centre_rad: float | None = None  # middle of the second posture, or None where the joint has no room for one
 
     @staticmethod
     def within(
@@ -172,21 +160,13 @@ class Relax:
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """One recording: motions in order, and what it is for. Itself a motion, so that one mark covers it.
+    """One recording: motions in order, and what it is for. Itself a motion, so that one mark covers it."""
 
-    Attributes:
-        name: of the experiment and its log.
-        role: ``identification`` (fitted) or ``validation`` (never fitted).
-        payload: the known payload is mounted.
-        motions: in order; each starts where the one before ends.
-        reveals: what it separates, for a person.
-    """
-
-    name: str
-    role: str
-    payload: bool
-    motions: tuple[Motion, ...]
-    reveals: str = field(default="", compare=False)
+    name: str  # of the experiment and its log
+    role: str  # ``identification`` (fitted) or ``validation`` (never fitted)
+    payload: bool  # the known payload is mounted
+    motions: tuple[Motion, ...]  # in order; each starts where the one before ends
+    reveals: str = field(default="", compare=False)  # what it separates, for a person
 
     @property
     def duration_s(self) -> float:

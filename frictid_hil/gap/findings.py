@@ -17,69 +17,46 @@ from frictid_hil.gap.posterior import FORM, Draw, Posterior
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
-DRAWS = 400
-"""Samples of each channel's posterior: a chance is known to 0.025."""
+DRAWS = 400  # samples of each channel's posterior: a chance is known to 0.025
 VISIBLE = 0.5
 """Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
-ALIKE = 0.05
-"""Chance of another cause in the place of one from which the two are called confusable."""
-EVEN = 0.5
-"""Chance below which a cause is likelier not there."""
+ALIKE = 0.05  # chance of another cause in the place of one from which the two are called confusable
+EVEN = 0.5  # chance below which a cause is likelier not there
 SIDED = 0.75
 """Share of the chance on the side that is told, below which an error of the belief may as well be the other way round:
 it is no cause that could be told."""
-SURE = 0.99
-"""Most that is claimed: one world in a hundred is of a kind that nobody thought of."""
-UNTOLD = 0.8
-"""Most that is claimed of a cause of which the recordings tell a size and no number."""
+SURE = 0.99  # most that is claimed: one world in a hundred is of a kind that nobody thought of
+UNTOLD = 0.8  # most that is claimed of a cause of which the recordings tell a size and no number
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One cause.
+    """One cause."""
 
-    Attributes:
-        effect: its name.
-        chance: that it shows.
-        size: RMS of what it makes of the residual, over the noise floor; root mean square over the draws.
-        leads: chance that it is the largest cause.
-        parameters: medians with 95 % intervals; empty where only its size is known.
-        rivals: causes that stand in its place in other draws.
-        where: name of the channel in which it shows most.
-    """
-
-    effect: str
-    chance: float
-    size: float
-    leads: float
+    effect: str  # its name
+    chance: float  # that it shows
+    size: float  # RMS of what it makes of the residual, over the noise floor; root mean square over the draws
+    leads: float  # chance that it is the largest cause
+    # Medians with 95 % intervals; empty where only its size is known.
     parameters: Mapping[str, Value] = field(default_factory=dict)
-    rivals: tuple[str, ...] = ()
-    where: str = ""
+    rivals: tuple[str, ...] = ()  # causes that stand in its place in other draws
+    where: str = ""  # name of the channel in which it shows most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sampled:
-    """Draws of one channel's posterior.
+    """Draws of one channel's posterior."""
 
-    Attributes:
-        posterior: of the channel.
-        draws: samples.
-        sizes: by cause, its size over the floor in every draw less what others take back, (draws,); 0 if not in.
-        blurs: by cause, one-sigma of what the forms of the others may have put on it, in the same unit.
-        believed: by cause, one-sigma of its size before anything is recorded, in the same unit.
-        generic: the same of all generic functions together.
-        explained: the same of all causes together.
-        gram: mean products of the channel's columns over all its rows, shape (m, m).
-    """
-
-    posterior: Posterior
-    draws: Sequence[Draw]
+    posterior: Posterior  # of the channel
+    draws: Sequence[Draw]  # samples
+    # By cause, its size over the floor in every draw less what others take back, (draws,); 0 if not in.
     sizes: Mapping[str, Array]
+    # By cause, one-sigma of what the forms of the others may have put on it, in the same unit.
     blurs: Mapping[str, Array]
-    believed: Mapping[str, Array]
-    generic: Array
-    explained: Array
-    gram: Array
+    believed: Mapping[str, Array]  # by cause, one-sigma of its size before anything is recorded, in the same unit
+    generic: Array  # the same of all generic functions together
+    explained: Array  # the same of all causes together
+    gram: Array  # mean products of the channel's columns over all its rows, shape (m, m)
 
 
 def sampled(posterior: Posterior) -> Sampled:

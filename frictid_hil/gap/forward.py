@@ -21,25 +21,17 @@ from frictid_hil.simulation.replay import CarryOver, Controller, Simulated, clos
 
 Effects = Mapping[str, Mapping[str, float]]
 
-SAME_RATE = 0.05
-"""A row holds a whole number of control ticks where the two clocks differ by no more than this share."""
-SETTLING_S = 0.3
-"""Time the controller takes after the first slide to forget the start."""
+SAME_RATE = 0.05  # a row holds a whole number of control ticks where the two clocks differ by no more than this share
+SETTLING_S = 0.3  # time the controller takes after the first slide to forget the start
 
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """Recorded minus simulated, low-passed once; arrays of shape (n,).
+    """Recorded minus simulated, low-passed once; arrays of shape (n,)."""
 
-    Attributes:
-        torque_nm: difference of torque.
-        position_rad: difference of position.
-        settled: first row that what friction held before the recording no longer touches.
-    """
-
-    torque_nm: Array
-    position_rad: Array
-    settled: int = 0
+    torque_nm: Array  # difference of torque
+    position_rad: Array  # difference of position
+    settled: int = 0  # first row that what friction held before the recording no longer touches
 
 
 def why_not(experiments: ExperimentSet) -> str | None:

@@ -22,14 +22,10 @@ It comes so near to some effects that it says nothing for a verdict; what it add
 """
 WHOLE = ("torque", "position")
 """Families that keep what a wrong belief could say, too: a gain that droops, a cable that pulls."""
-WAYS_RAD = (5e-4, 2e-3, 8e-3)
-"""Ways within which a start may be forgotten."""
-REST_S = 0.1
-"""Rests count by their logarithm from about this length."""
-STILL_S = 0.08
-"""Time without motion that counts as a rest."""
-REACHES = (0.1, 0.25, 0.5)
-"""Travels over which such a torque builds up, over the whole travel."""
+WAYS_RAD = (5e-4, 2e-3, 8e-3)  # ways within which a start may be forgotten
+REST_S = 0.1  # rests count by their logarithm from about this length
+STILL_S = 0.08  # time without motion that counts as a rest
+REACHES = (0.1, 0.25, 0.5)  # travels over which such a torque builds up, over the whole travel
 
 
 def families(views: Sequence[View]) -> dict[str, list[Array]]:

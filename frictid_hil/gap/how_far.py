@@ -18,34 +18,23 @@ from frictid_hil.gap.residuals import rms
 
 COLOUR = 2.0
 """Noise at most, over what is white in it or comes from the position: a slow part three times as strong in power."""
-FEW = 40
-"""Draws from which the interval of a gap is read: its ends are known to a tenth of its width."""
+FEW = 40  # draws from which the interval of a gap is read: its ends are known to a tenth of its width
 APPEARED = 2.5
 """Rest of a validation log over that of the fitted ones from which something is in it that was not there before."""
-WINDOW_S = 1.0
-"""Time over which such a rest is averaged to tell since when."""
+WINDOW_S = 1.0  # time over which such a rest is averaged to tell since when
 
 
 @dataclass(frozen=True, slots=True)
 class Closed:
-    """One channel's gap on the validation logs, in its own unit.
+    """One channel's gap on the validation logs, in its own unit."""
 
-    Attributes:
-        channel: its name.
-        before: RMS of the residual.
-        after: RMS with the named causes taken off.
-        low: 95 % interval of ``after``.
-        high: see there.
-        floor: RMS that noise alone leaves.
-        appeared: (log, seconds) where something shows that no identification log holds; None where nothing does.
-    """
-
-    channel: str
-    before: float
-    after: float
-    low: float
+    channel: str  # its name
+    before: float  # RMS of the residual
+    after: float  # RMS with the named causes taken off
+    low: float  # 95 % interval of ``after``
     high: float
-    floor: float
+    floor: float  # RMS that noise alone leaves
+    # (log, seconds) where something shows that no identification log holds; None where nothing does.
     appeared: tuple[str, float] | None = None
 
 

@@ -12,15 +12,10 @@ from frictid_hil.simulation.effects import all_effects
 
 @dataclass(frozen=True, slots=True)
 class KinematicFit:
-    """What the kinematic channel says.
+    """What the kinematic channel says."""
 
-    Attributes:
-        read: effect name -> value of its parameter, whether it shows or not.
-        found: effect name -> parameters, of those that show.
-    """
-
-    read: Mapping[str, float]
-    found: Mapping[str, Mapping[str, float]]
+    read: Mapping[str, float]  # effect name -> value of its parameter, whether it shows or not
+    found: Mapping[str, Mapping[str, float]]  # effect name -> parameters, of those that show
 
 
 def fit_kinematics(

@@ -25,14 +25,10 @@ from frictid_hil.gap.residuals import LowPass, Recording, nominal_torque, view_o
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import View
 
-DECIDES_NATS = math.log(20.0)
-"""Evidence that decides: odds of 20 to 1."""
-TELLS_NATS = 0.1
-"""Evidence below which an experiment tells nothing: odds of 1.1 to 1."""
-SET_UP_S = 20.0
-"""Time that an experiment costs besides its motion: the question, the way there and back."""
-SECOND_POSTURE_RAD = 1.2
-"""Distance of the second posture from the first."""
+DECIDES_NATS = math.log(20.0)  # evidence that decides: odds of 20 to 1
+TELLS_NATS = 0.1  # evidence below which an experiment tells nothing: odds of 1.1 to 1
+SET_UP_S = 20.0  # time that an experiment costs besides its motion: the question, the way there and back
+SECOND_POSTURE_RAD = 1.2  # distance of the second posture from the first
 _DEFAULT = (
     "chirp",
     "the full set with varied motion: two travels, a slow triangle, a chirp, break-away, and payload on and off",
@@ -43,17 +39,11 @@ _STANDARD = ("sines_small", "sines_large", "triangle_slow", "sines_payload", "ch
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What an experiment is expected to bring.
+    """What an experiment is expected to bring."""
 
-    Attributes:
-        name: of the experiment.
-        evidence_nats: for the right one of two causes.
-        duration_s: of its motion.
-    """
-
-    name: str
-    evidence_nats: float
-    duration_s: float
+    name: str  # of the experiment
+    evidence_nats: float  # for the right one of two causes
+    duration_s: float  # of its motion
 
 
 def next_experiment(

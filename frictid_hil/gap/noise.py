@@ -15,10 +15,8 @@ from scipy import linalg
 
 from frictid_hil.friction.trajectory import Array
 
-LOCAL_S = 0.3
-"""Time over which the size of the noise may change: a reversal, a stop."""
-ORDER = 8
-"""Rows that a row is predicted from: 0.16 s at 50 Hz, several times what the low-pass smears."""
+LOCAL_S = 0.3  # time over which the size of the noise may change: a reversal, a stop
+ORDER = 8  # rows that a row is predicted from: 0.16 s at 50 Hz, several times what the low-pass smears
 
 
 def autocovariance(residuals: Sequence[Array], rows_per_freedom: float = 1.0) -> Array:

@@ -15,14 +15,10 @@ from frictid_hil.gap.tolerances import Sigma
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import View
 
-FREE = 10.0
-"""One-sigma of a share that was fitted to these very logs: nothing is believed of it."""
-SAME_RATE = 0.05
-"""Rows and control ticks are the same where their rates differ by no more than this share."""
-ANYWHERE = 0.3
-"""One-sigma of a moment that is known to lie in a row, over the row: evenly spread, 1/sqrt(12)."""
-STIFFER = 0.1
-"""Step of the presliding stiffness by which its derivative is formed."""
+FREE = 10.0  # one-sigma of a share that was fitted to these very logs: nothing is believed of it
+SAME_RATE = 0.05  # rows and control ticks are the same where their rates differ by no more than this share
+ANYWHERE = 0.3  # one-sigma of a moment that is known to lie in a row, over the row: evenly spread, 1/sqrt(12)
+STIFFER = 0.1  # step of the presliding stiffness by which its derivative is formed
 _ESTIMATED = {
     "inertia_error": "inertia",
     "gravity_error": "inertia",

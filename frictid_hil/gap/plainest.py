@@ -11,12 +11,10 @@ from frictid_hil.gap.channel import FAMILY, Term
 from frictid_hil.gap.posterior import FORM, Draw, Posterior
 from frictid_hil.simulation.effects import all_effects
 
-SPEED = FAMILY + "velocity"
-"""Functions of speed without a name."""
+SPEED = FAMILY + "velocity"  # functions of speed without a name
 CANCELS = 0.25
 """Power of what causes make together over that of the largest, below which they mostly cancel: half of its size."""
-CLEAR = 1.96
-"""One-sigmas of a belief from which on its error is a cause of its own: 95 %."""
+CLEAR = 1.96  # one-sigmas of a belief from which on its error is a cause of its own: 95 %
 
 
 def plainest(posterior: Posterior, draw: Draw, gram: Array) -> Draw:

@@ -22,20 +22,14 @@ from frictid_hil.simulation.inverse import View
 
 BEYOND = 6.0
 """One-sigma of a belief that is plainly wrong, over its tolerance, at least: then the tolerance says little more."""
-SIZES = (0.1, 0.3, 1.0)
-"""Sizes of a generic function, over what a cause may well make: half decades."""
-BANDS_HZ = (20.0, 40.0, 80.0, 160.0)
-"""Cut-offs to choose from."""
-EACH_LOG = "each log"
-"""Family of what differs from log to log, and says nothing of a further one."""
-SEVERAL = 3
-"""Logs from which on what is of one log alone can be told from what is of all."""
+SIZES = (0.1, 0.3, 1.0)  # sizes of a generic function, over what a cause may well make: half decades
+BANDS_HZ = (20.0, 40.0, 80.0, 160.0)  # cut-offs to choose from
+EACH_LOG = "each log"  # family of what differs from log to log, and says nothing of a further one
+SEVERAL = 3  # logs from which on what is of one log alone can be told from what is of all
 SWAMPED = 3.0
 """Noise of the position over that of the median row, from which on a row tells nothing: a ninth of the others."""
-UNTOLD = 0.1
-"""The same over the friction level, below which a row does tell something."""
-LINE_ROWS = 20_000
-"""Rows of a log by which lines are looked for at most."""
+UNTOLD = 0.1  # the same over the friction level, below which a row does tell something
+LINE_ROWS = 20_000  # rows of a log by which lines are looked for at most
 LINE_SHARE = 0.1
 """Part of what a low-pass takes away that a line over position must describe to be let through; noise gives 1e-3."""
 

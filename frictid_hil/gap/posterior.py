@@ -23,37 +23,25 @@ from frictid_hil.gap import noise
 from frictid_hil.gap.channel import FAMILY, Channel, Term
 from frictid_hil.gap.residuals import rms
 
-SLOW = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
-"""Variance of the slow part over that of the noise: half decades."""
-MEMORY_S = (0.1, 0.5)
-"""Its time constants: a reversal, a move."""
-CARE = (0.1, 0.3, 1.0)
-"""True one-sigma of a belief over the stated one: makers round up, rarely down."""
-EXPECTED = 1.0
-"""Causes that a joint is expected to have, before anything is recorded."""
-WORTH = 10.0
-"""Log-odds below the best from which a set of causes is not grown further: a chance of 1 in 20 000."""
-MOST = 8
-"""Terms of a model at most."""
-TRIED = 6
-"""Extensions of a model that are scored at every point of the grid."""
-REDRAWN = 20
-"""Times that a draw outside of its bounds is drawn anew before it is put on them."""
-STRETCHES = 6
-"""Parts of the recordings that are left out one by one, at least."""
+SLOW = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)  # variance of the slow part over that of the noise: half decades
+MEMORY_S = (0.1, 0.5)  # its time constants: a reversal, a move
+CARE = (0.1, 0.3, 1.0)  # true one-sigma of a belief over the stated one: makers round up, rarely down
+EXPECTED = 1.0  # causes that a joint is expected to have, before anything is recorded
+WORTH = 10.0  # log-odds below the best from which a set of causes is not grown further: a chance of 1 in 20 000
+MOST = 8  # terms of a model at most
+TRIED = 6  # extensions of a model that are scored at every point of the grid
+REDRAWN = 20  # times that a draw outside of its bounds is drawn anew before it is put on them
+STRETCHES = 6  # parts of the recordings that are left out one by one, at least
 FORM = 0.1
 """One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
 MOST_DOUBT = 3.0
 """Variance that forms may lend to what tells causes apart, at most: more of it shows in the noise itself."""
-ROUNDING = 1e-12
-"""Share of a matrix' largest entry that rounding may leave in the others."""
+ROUNDING = 1e-12  # share of a matrix' largest entry that rounding may leave in the others
 SURE = 5.0
 """Mean of a coefficient over its one-sigma, from which on its term is a whole model of its cause; a lag between two
 shapes may be shared by them."""
-UNNAMED = FAMILY + "rest"
-"""What a draw holds besides its terms."""
-POINTS = 4
-"""Points of the grid, the likeliest, at which all candidates are compared."""
+UNNAMED = FAMILY + "rest"  # what a draw holds besides its terms
+POINTS = 4  # points of the grid, the likeliest, at which all candidates are compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,34 +55,21 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A set of terms with its score.
+    """A set of terms with its score."""
 
-    Attributes:
-        terms: numbers of the channel's candidates.
-        effects: their causes.
-        score: logarithm of the chance of the recordings, its prior included.
-        by_setting: the same by point of the grid, shape (g,).
-    """
-
-    terms: tuple[int, ...]
-    effects: frozenset[str]
-    score: float
-    by_setting: Array
+    terms: tuple[int, ...]  # numbers of the channel's candidates
+    effects: frozenset[str]  # their causes
+    score: float  # logarithm of the chance of the recordings, its prior included
+    by_setting: Array  # the same by point of the grid, shape (g,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Known:
-    """What is known of a model's coefficients, nuisances included.
+    """What is known of a model's coefficients, nuisances included."""
 
-    Attributes:
-        terms: that they belong to, in order.
-        mean: of all coefficients, shape (k,).
-        root: of their covariance, shape (k, k).
-    """
-
-    terms: tuple[Term, ...]
-    mean: Array
-    root: Array
+    terms: tuple[Term, ...]  # that they belong to, in order
+    mean: Array  # of all coefficients, shape (k,)
+    root: Array  # of their covariance, shape (k, k)
 
 
 class Posterior:

@@ -29,27 +29,18 @@ FURTHER = (
 )
 SLOW_RAD_S = (0.01, 0.05)
 """Speeds over which friction may fall when sliding begins: what a Stribeck effect makes is not the form's."""
-BEGINS_RAD_S = 0.02
-"""Speed at which friction counts as that of a joint that begins to slide."""
-WRONG = 0.1
-"""Error of the level, over it, from which on the travel is in question."""
-ROUNDS = 3
-"""Times that level and travel are fitted to one another."""
-CLEARLY = 0.95
-"""Squares that remain with another travel, over those with the believed one, at most."""
+BEGINS_RAD_S = 0.02  # speed at which friction counts as that of a joint that begins to slide
+WRONG = 0.1  # error of the level, over it, from which on the travel is in question
+ROUNDS = 3  # times that level and travel are fitted to one another
+CLEARLY = 0.95  # squares that remain with another travel, over those with the believed one, at most
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """What one form leaves, and the level that it finds.
+    """What one form leaves, and the level that it finds."""
 
-    Attributes:
-        left: squares of the torque that remain.
-        level_nm: of friction where the joint begins to slide.
-    """
-
-    left: float
-    level_nm: float
+    left: float  # squares of the torque that remain
+    level_nm: float  # of friction where the joint begins to slide
 
 
 def as_it_yields(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]:

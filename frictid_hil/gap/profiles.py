@@ -17,46 +17,29 @@ from frictid_hil.gap.residuals import LowPass, Recording, recordings
 from frictid_hil.gap.sanity import completed
 
 BINS = 48
-LEAST_ROWS = 8
-"""Rows in a bin below which it is left out."""
+LEAST_ROWS = 8  # rows in a bin below which it is left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """One curve; arrays of shape (k,).
+    """One curve; arrays of shape (k,)."""
 
-    Attributes:
-        name: of the curve.
-        x: middle of each bin.
-        y: mean there.
-        low: lower quartile; None where only one value is known.
-        high: upper quartile.
-    """
-
-    name: str
-    x: Array
-    y: Array
-    low: Array | None = None
-    high: Array | None = None
+    name: str  # of the curve
+    x: Array  # middle of each bin
+    y: Array  # mean there
+    low: Array | None = None  # lower quartile; None where only one value is known
+    high: Array | None = None  # upper quartile
 
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """The missing torque over one quantity.
+    """The missing torque over one quantity."""
 
-    Attributes:
-        title: what it shows.
-        x_title: quantity and unit.
-        y_title: quantity and unit.
-        curves: one or several.
-        caption: how to read it.
-    """
-
-    title: str
-    x_title: str
-    y_title: str
-    curves: tuple[Curve, ...]
-    caption: str
+    title: str  # what it shows
+    x_title: str  # quantity and unit
+    y_title: str  # quantity and unit
+    curves: tuple[Curve, ...]  # one or several
+    caption: str  # how to read it
 
 
 def missing_torque(experiments: ExperimentSet) -> tuple[Profile, ...]:

@@ -26,38 +26,25 @@ from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet
 from frictid_hil.simulation.inverse import View
 from frictid_hil.simulation.inverse_loops import bent, lagged
 
-CUTOFF_HZ = 20.0
-"""Low-pass of everything that is compared (zero phase, fourth order); lower where the sampling is slow."""
+CUTOFF_HZ = 20.0  # low-pass of everything that is compared (zero phase, fourth order); lower where the sampling is slow
 
 LATE = (0.5, 0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0)
 """How late a row's torque may be, in rows; the mean over the row comes first."""
-SETTLED_S = 0.5
-"""The controller's integral is unknown at the start; its level is read from this first stretch."""
+SETTLED_S = 0.5  # the controller's integral is unknown at the start; its level is read from this first stretch
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One experiment on a uniform clock with its residuals; arrays have shape (n,), None where they cannot be formed.
+    """One experiment on a uniform clock with its residuals; arrays of shape (n,), None where they cannot be formed."""
 
-    Attributes:
-        experiment: as recorded, resampled where its clock was not uniform.
-        step_s: sampling step.
-        resampled: the clock was not uniform.
-        view: what inverse forms see; None without torque.
-        plant_nm: P, unfiltered.
-        demand_nm: the controller's replayed demand, in force from each sample on.
-        actuation_nm: A, unfiltered.
-        kinematic_rad_s: K.
-    """
-
-    experiment: Experiment
-    step_s: float
-    resampled: bool
-    view: View | None
-    plant_nm: Array | None
-    demand_nm: Array | None
-    actuation_nm: Array | None
-    kinematic_rad_s: Array | None
+    experiment: Experiment  # as recorded, resampled where its clock was not uniform
+    step_s: float  # sampling step
+    resampled: bool  # the clock was not uniform
+    view: View | None  # what inverse forms see; None without torque
+    plant_nm: Array | None  # P, unfiltered
+    demand_nm: Array | None  # the controller's replayed demand, in force from each sample on
+    actuation_nm: Array | None  # A, unfiltered
+    kinematic_rad_s: Array | None  # K
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,19 +15,15 @@ from frictid_hil.gap.residuals import LowPass, controller_demand, friction_scale
 
 LARGEST_POSITION_RAD = 60.0
 """Beyond this, the position of a joint that does not turn on and on is more likely in degrees ..."""
-LARGEST_DEGREES = 720.0
-"""... but no such joint goes beyond this in degrees either: it turns on and on."""
+LARGEST_DEGREES = 720.0  # ... but no such joint goes beyond this in degrees either: it turns on and on.
 LARGEST_SPEED_RAD_S = 40.0
 """Beyond this, the speed of a geared joint is more likely in degrees per second, or its time in another unit."""
-LARGEST_SPEED_SHARE = 5.0
-"""Times the highest speed of the believed friction curve that a position in rad may reach."""
+LARGEST_SPEED_SHARE = 5.0  # times the highest speed of the believed friction curve that a position in rad may reach
 LEAST_ROWS = 200
-SLOWEST_STEP_S = 0.2
-"""Sampling steps longer than this are more likely in milliseconds."""
+SLOWEST_STEP_S = 0.2  # sampling steps longer than this are more likely in milliseconds
 OTHER_UNIT = 20.0
 """Factor between what a nominal joint or its controller asks for and what was measured that no joint explains."""
-LONGEST_HALT = 0.25
-"""Part of a log in which a position may repeat itself far from its command."""
+LONGEST_HALT = 0.25  # part of a log in which a position may repeat itself far from its command
 
 _COLUMNS = (
     "time_s", "position_rad", "velocity_rad_s", "torque_nm", "position_command_rad", "rigid_body_torque_nm",

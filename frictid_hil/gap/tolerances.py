@@ -45,17 +45,11 @@ _SIGMAS_PER_INTERVAL = 2.0 * 1.96
 
 @dataclass(frozen=True, slots=True)
 class Sigma:
-    """One standard deviation of a believed number.
+    """One standard deviation of a believed number."""
 
-    Attributes:
-        relative: its part that is a share of the number.
-        absolute: its part in the number's own unit.
-        source: ``stated``, or the kind of number whose default it is.
-    """
-
-    relative: float
-    absolute: float
-    source: str
+    relative: float  # its part that is a share of the number
+    absolute: float  # its part in the number's own unit
+    source: str  # ``stated``, or the kind of number whose default it is
 
     def of(self, value: float) -> float:
         """One-sigma of this value, in its unit."""

@@ -14,10 +14,8 @@ from frictid_hil.gap.residuals import LowPass, Recording, rms
 from frictid_hil.simulation.drive_form import Link, TrackingForm
 from frictid_hil.simulation.effects import all_effects
 
-STEPS = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.4, 2.0, 3.0)
-"""Values of a link that are tried, over its usual size."""
-SPREAD = 0.2
-"""One-sigma of a column's coefficient: half the way to the next value that is tried."""
+STEPS = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.4, 2.0, 3.0)  # values of a link that are tried, over its usual size
+SPREAD = 0.2  # one-sigma of a column's coefficient: half the way to the next value that is tried
 
 
 def tracking_channel(recordings: Sequence[Recording], library: Collection[str]) -> Channel | None:

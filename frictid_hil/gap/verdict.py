@@ -14,49 +14,35 @@ from frictid_hil.gap.how_far import Closed, coefficients
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
-FLOORS = 2.0
-"""A gap below so many noise floors is none, by promise."""
-AS_STATED = 0.5
-"""Error of a belief over its one-sigma, below which it is as right as it says."""
+FLOORS = 2.0  # a gap below so many noise floors is none, by promise
+AS_STATED = 0.5  # error of a belief over its one-sigma, below which it is as right as it says
 FLOORS_AS_STATED = 3.0
 """A gap below so many floors is none, too, if it means nothing in practice and every belief is as right as it says."""
 STANDS_OUT = 1.0
 """Size of all causes together, over the floor, below which nothing is named: less than what noise itself makes."""
 UNNAMED = 0.33
 """Size of what has no name over that of all causes, from which on their names do not tell the gap: 11 % of power."""
-REMAINS = 0.2
-"""Part of a gap that stays, from which on it may hold another cause: 4 % of its power."""
+REMAINS = 0.2  # part of a gap that stays, from which on it may hold another cause: 4 % of its power
 DOUBTED = 0.8
 """Most that is claimed of causes that close the gap although functions without a name would describe it as well."""
-HALF = 0.5
-"""Part of a gap from which on it is open although causes were named."""
-HELPS = 0.98
-"""Gap of the validation logs with the causes over that without, above which they explain nothing there."""
-READ_DIRECTLY = "kinematics"
-"""Where a cause is read from positions and velocities themselves."""
-LISTED = 0.25
-"""Chance from which a cause is listed."""
+HALF = 0.5  # part of a gap from which on it is open although causes were named
+HELPS = 0.98  # gap of the validation logs with the causes over that without, above which they explain nothing there
+READ_DIRECTLY = "kinematics"  # where a cause is read from positions and velocities themselves
+LISTED = 0.25  # chance from which a cause is listed
 NEEDED = 0.85
 """Chance that no tolerance makes up for a cause, from which it is told however small the gap is in practice."""
 CERTAIN = 0.95
 """Chance of a cause, and of being the largest one, from which it is told although the gap is within noise."""
-LEADS = 0.6
-"""Chance of being the largest cause below which a rival makes the answer ambiguous."""
+LEADS = 0.6  # chance of being the largest cause below which a rival makes the answer ambiguous
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What is said.
+    """What is said."""
 
-    Attributes:
-        word: ``none``, ``explained``, ``ambiguous`` or ``unknown``.
-        named: causes that are listed, the first one first.
-        place: where an unexplained gap lives.
-    """
-
-    word: str
-    named: tuple[Finding, ...]
-    place: str = ""
+    word: str  # ``none``, ``explained``, ``ambiguous`` or ``unknown``
+    named: tuple[Finding, ...]  # causes that are listed, the first one first
+    place: str = ""  # where an unexplained gap lives
 
 
 def verdict(

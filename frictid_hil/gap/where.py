@@ -22,14 +22,11 @@ from frictid_hil.gap.residuals import LowPass, Recording
 from frictid_hil.simulation.effect import Region
 from frictid_hil.simulation.inverse import View
 
-FAST_HZ = 3.0
-"""Changes of the residual above this frequency, that nothing else describes, are the region of frequency."""
+FAST_HZ = 3.0  # changes of the residual above this frequency, that nothing else describes, are the region of frequency
 SPEED_BANDS = (0.0, 0.015, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75)
 """Lower edges of the bands of speed, as shares of the top speed; two are told as one."""
-STILL = 0.003
-"""Share of the top speed below which a joint stands."""
-RIPPLE_ORDERS = (1, 2, 4)
-"""Cycles per motor revolution that count as position."""
+STILL = 0.003  # share of the top speed below which a joint stands
+RIPPLE_ORDERS = (1, 2, 4)  # cycles per motor revolution that count as position
 
 _WORDS = {
     Region.ACTUATION: "between what the controller asks for and what the drive delivers",
