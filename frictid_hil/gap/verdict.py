@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -207,11 +208,7 @@ def _root_sum(sizes: Sequence[np.ndarray]) -> np.ndarray:
 def _place(channels: Sequence[Sampled]) -> str:
     """Generic functions that hold most of what no cause explains, in words."""
     loudest = max(channels, key=lambda channel: float(np.median(channel.generic)))
-    counts: dict[str, int] = {}
-    for draw in loudest.draws:
-        for effect in draw.model.effects:
-            if effect.startswith(FAMILY):
-                counts[effect] = counts.get(effect, 0) + 1
-    names = sorted(counts, key=lambda name: -counts[name])[:2]
+    counts = Counter(e for draw in loudest.draws for e in draw.model.effects if e.startswith(FAMILY))
+    names = sorted(counts, key=lambda name: (-counts[name], name))[:2]
     words = " and ".join(name.removeprefix(FAMILY) for name in names)
     return f"{loudest.posterior.channel.name}: {words}" if words else loudest.posterior.channel.name
