@@ -72,21 +72,14 @@ def why_not_replayed(nominal: Nominal, recordings: Sequence[Recording]) -> str |
 
 
 def actuation_channel(
-    nominal: Nominal,
-    recordings: Sequence[Recording],
-    library: Collection[str],
-    seen: Mapping[str, float],
+    nominal: Nominal,  # the believed joint
+    recordings: Sequence[Recording],  # all logs of the set
+    library: Collection[str],  # effects that may be used
+    seen: Mapping[str, float],  # effect -> value found in the kinematic channel
+    # The believed joint recorded as the same logs, where it can be simulated: what it shows is no gap.
     believed: Sequence[Recording] = (),
 ) -> Channel | None:
-    """The channel of a set; None where the demand cannot be formed.
-
-    Args:
-        nominal: the believed joint.
-        recordings: all logs of the set.
-        library: effects that may be used.
-        seen: effect -> value found in the kinematic channel.
-        believed: the believed joint recorded as the same logs, where it can be simulated: what it shows is no gap.
-    """
+    """The channel of a set; None where the demand cannot be formed."""
     if why_not_replayed(nominal, recordings) is not None:
         return None
     logs = [r for r in recordings if r.experiment.torque_nm is not None and r.demand_nm is not None]

@@ -96,13 +96,7 @@ class _Table:
 
 
 class _Bodies:
-    """Columns of the arm, made by the user's engine.
-
-    Args:
-        robot: the model.
-        joints: names, in the order of the recordings.
-        held: where the other joints stand.
-    """
+    """Columns of the arm, made by the user's engine; the joints in the order of the recordings, the others held."""
 
     def __init__(self, robot: RobotModel, joints: Sequence[str], held: Mapping[str, float]) -> None:
         self._robot = robot
@@ -205,23 +199,14 @@ class _Bodies:
 
 
 def find_in_arm(
-    robot: RobotModel,
-    joints: Sequence[str],
-    held: Mapping[str, float],
-    curves: Sequence[FrictionCurve | None],
-    recordings: Sequence[Recorded],
-    mass_tolerance: float = 0.03,
+    robot: RobotModel,  # the user's model
+    joints: Sequence[str],  # of the recordings, k of them
+    held: Mapping[str, float],  # where the others stand
+    curves: Sequence[FrictionCurve | None],  # friction that is believed, by joint
+    recordings: Sequence[Recorded],  # of all joints; at least one is fitted
+    mass_tolerance: float = 0.03,  # one-sigma of every link's mass within which a difference is no cause
 ) -> ArmFindings:
-    """Weigh the causes of the arm; deterministic.
-
-    Args:
-        robot: the user's model.
-        joints: of the recordings, k of them.
-        held: where the others stand.
-        curves: friction that is believed, by joint.
-        recordings: of all joints; at least one is fitted.
-        mass_tolerance: one-sigma of every link's mass within which a difference is no cause.
-    """
+    """Weigh the causes of the arm; deterministic."""
     bodies = _Bodies(robot, joints, held)
     tables = [_table(bodies, curves, r) for r in recordings]
     fitted = [t for t in tables if not t.validation] or tables

@@ -41,10 +41,7 @@ class Loop:
 def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[Verdict, str | None]:
     """The verdict as far as the closed loop bears it out, and what to tell of that.
 
-    Args:
-        said: the verdict so far.
-        loop: of the set.
-        open_along: the causes leave half of the visible gap along the measured motion.
+    ``open_along``: the causes leave half of the visible gap along the measured motion.
 
     Causes are added one by one, the one that helps most first, as long as one takes ``REMAINS`` of the visible gap or
     more; where that leaves a gap, all are added and those taken off that do harm. A cause is refuted that adds
@@ -81,15 +78,7 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
 
 
 def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm: float, loop: Loop) -> set[str]:
-    """Causes that do harm: ``HALF`` of the visible gap, or ``REMAINS`` of it both beside the chosen ones and among all.
-
-    Args:
-        said: the verdict so far.
-        values: parameters of all causes.
-        beside: the gap with each cause that was not chosen, N m.
-        gap_nm: with the chosen ones.
-        loop: of the set.
-    """
+    """Causes that do harm: ``HALF`` of the visible gap, or ``REMAINS`` of it both beside the chosen ones and among all."""
     spared = {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
     added = {n: (nm**2 - gap_nm**2) / loop.visible for n, nm in beside.items() if n not in spared}
     refuted = {name for name, share in added.items() if share > HALF**2}

@@ -48,12 +48,9 @@ UNDECIDED = 0.5  # most that is claimed of causes that a motion or the lack of a
 def diagnose(
     experiments: ExperimentSet, *, library: Collection[str] | None = None, negligible: float = NEGLIGIBLE
 ) -> Diagnosis:
-    """Diagnose one joint; deterministic.
+    """Diagnose one joint with the effects of a library (all unless given); deterministic.
 
-    Args:
-        experiments: nominal joint and recordings.
-        library: names of the effects that may be used; all of them unless given.
-        negligible: gap that the user calls none, as a share of the friction level.
+    ``negligible`` is the gap that the user calls none, as a share of the friction level.
     """
     allowed = tuple(n for n in all_effects() if library is None or n in library)
     experiments, reasons = completed(in_force(as_meant(checked(experiments))))

@@ -168,20 +168,13 @@ class ExperimentSet:
 
 
 def experiment_set(
-    told: NominalFile,
-    data: Mapping[str, Any],
-    where: str,
-    name: str,
-    logs: Sequence[tuple[config.ExperimentFile, Samples]],
+    told: NominalFile,  # what the file says
+    data: Mapping[str, Any],  # the same as a plain mapping, further keys included
+    where: str,  # the file, for errors
+    name: str,  # of the set
+    logs: Sequence[tuple[config.ExperimentFile, Samples]],  # entries of the file, each with its recording
 ) -> ExperimentSet:
     """A set from a checked ``nominal.yaml`` and its recordings, in run order.
-
-    Args:
-        told: what the file says.
-        data: the same as a plain mapping, further keys included.
-        where: the file, for errors.
-        name: of the set.
-        logs: entries of the file, each with its recording.
 
     Raises:
         ConfigError: a believed number makes no sense.

@@ -56,23 +56,15 @@ class Envelope:
 
     @staticmethod
     def within(
-        position_min_rad: float,
-        position_max_rad: float,
-        max_velocity_rad_s: float,
+        position_min_rad: float,  # lower software limit
+        position_max_rad: float,  # upper software limit
+        max_velocity_rad_s: float,  # limit of the joint; the sines reach 90 % of it at most
         *,
-        centre_rad: float | None = None,
-        travel_rad: float | None = None,
-        velocity_rad_s: float | None = None,
+        centre_rad: float | None = None,  # middle of the travel; the middle of the limits unless given
+        travel_rad: float | None = None,  # of the small sines; at most a quarter of what there is
+        velocity_rad_s: float | None = None,  # peak speed of the sines; at most 2 rad/s unless given
     ) -> Envelope:
         """The widest envelope that keeps clear of the limits.
-
-        Args:
-            position_min_rad: lower software limit.
-            position_max_rad: upper software limit.
-            max_velocity_rad_s: limit of the joint; the sines reach 90 % of it at most.
-            centre_rad: middle of the travel; the middle of the limits unless given.
-            travel_rad: of the small sines; at most a quarter of what there is.
-            velocity_rad_s: peak speed of the sines; at most 2 rad/s unless given.
 
         Raises:
             UsageError: less than 5 degrees are left for the small sines.
@@ -210,12 +202,7 @@ class Experiment:
 
 
 def catalogue(envelope: Envelope, *, seed: int = 0) -> dict[str, Experiment]:
-    """Every experiment by name, the second posture only where there is room for one.
-
-    Args:
-        envelope: where and how fast.
-        seed: of the validation moves, which are drawn at random.
-    """
+    """Every experiment by name, the second posture only where there is room for one; moves are drawn by the seed."""
     e = envelope
     small, large = e.centre_rad - e.travel_rad / 2, e.centre_rad - e.travel_rad
     shuffled = tuple(e.velocity_rad_s * n / 6 for n in (5, 2, 6, 3, 1, 4))
@@ -269,11 +256,7 @@ def plan_document(names: Iterable[str], why: str) -> dict[str, Any]:
 
 
 def names_of_plan(document: Any, where: str) -> tuple[str, ...]:
-    """The experiments that a plan file asks for.
-
-    Args:
-        document: as read from YAML.
-        where: the file, for errors.
+    """The experiments that a plan file, as read from YAML, asks for.
 
     Raises:
         UsageError: it is no plan file.

@@ -94,11 +94,7 @@ def bounded(name: str, values: Mapping[str, float]) -> dict[str, float]:
 
 
 class Replay:
-    """Replays of one experiment set; the nominal model may carry any effects.
-
-    Args:
-        experiments: the set.
-    """
+    """Replays of one experiment set; the nominal model may carry any effects."""
 
     def __init__(self, experiments: ExperimentSet) -> None:
         self._experiments = tuple(uniform(e)[0] for e in experiments.experiments)
@@ -131,12 +127,9 @@ class Replay:
         return self._nominal.with_effects(merged)
 
     def __call__(self, effects: Effects, *, validation: bool | None = None) -> dict[str, Replayed]:
-        """Differences by experiment name.
+        """Differences by experiment name, of validation logs only, of the others only, or of all (None).
 
-        Args:
-            effects: parameters by effect.
-            validation: only those logs, only the others, or all (None). Warmth carries over in run order, so earlier
-                logs are simulated too where an effect remembers.
+        Warmth carries over in run order, so earlier logs are simulated too where an effect remembers.
         """
         model = self.model(effects)
         carried = any(all_effects()[name].carried for name in effects)

@@ -116,10 +116,7 @@ def _since_reversal(v: View, travel_rad: float) -> Array:
 def since_start(position_rad: Array, step_s: float, least_rad: float) -> tuple[Array, Array]:
     """(way since the motion last started or turned, rest before that) of every row, rad and s, shape (n,).
 
-    Args:
-        position_rad: measured, shape (n,).
-        step_s: sampling step.
-        least_rad: way that counts as motion.
+    A way of ``least_rad`` counts as motion.
     """
     way, rest = np.zeros(position_rad.size), np.zeros(position_rad.size)
     moving, direction, rested = False, 1.0, 0.0

@@ -51,12 +51,7 @@ def next_experiment(
 ) -> NextExperiment:
     """The experiment that parts two effects, as text and as a plan for ``gap record --plan``.
 
-    Args:
-        first: an effect.
-        second: its rival.
-        nominal: the believed joint.
-        logs: the recordings of the set.
-        plant: draws of the plant channel; None where no log has a torque.
+    ``plant`` holds draws of the plant channel; None where no log has a torque.
     """
     recorded = {log.experiment.name for log in logs}
     found = [] if plant is None else expected(first, second, nominal, logs, plant)
@@ -77,15 +72,7 @@ def next_experiment(
 def expected(
     first: str, second: str, nominal: Nominal, logs: Sequence[Recording], plant: Sampled
 ) -> tuple[Expected, ...]:
-    """What every experiment within the recorded travel and speed is expected to bring; none where no model tells.
-
-    Args:
-        first: an effect.
-        second: its rival.
-        nominal: the believed joint.
-        logs: the recordings of the set.
-        plant: draws of the plant channel.
-    """
+    """What every experiment within the recorded travel and speed is expected to bring; none where no model tells."""
     posterior = plant.posterior
     with_first, with_second = (posterior.rival(one, other) for one, other in ((first, second), (second, first)))
     if with_first is None or with_second is None:
@@ -143,15 +130,7 @@ def _columns(known: Known, view: View, low_pass: LowPass) -> Array:
 
 
 def _evidence(x_first: Array, first: Known, x_second: Array, second: Known, floor: float) -> float:
-    """Mean log-odds that rows bring for the right one of two Gaussian models, nats; whichever it is.
-
-    Args:
-        x_first: columns of the first model along the motion, shape (rows, coefficients).
-        first: what is known of its coefficients.
-        x_second: see there.
-        second: see there.
-        floor: RMS of the noise.
-    """
+    """Mean log-odds that rows bring for the right one of two Gaussian models, nats; x (rows, coefficients) each."""
     # Where neither model's columns reach, both say the same.
     basis, sizes, _ = np.linalg.svd(np.concatenate([x_first, x_second], axis=1), full_matrices=False)
     basis = basis[:, sizes > 1e-9 * max(float(sizes[0]), 1e-300)]

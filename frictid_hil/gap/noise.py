@@ -22,9 +22,7 @@ ORDER = 8  # rows that a row is predicted from: 0.16 s at 50 Hz, several times w
 def autocovariance(residuals: Sequence[Array], rows_per_freedom: float = 1.0) -> Array:
     """Of the residuals of several logs at lags 0 to ``ORDER``, shape (ORDER + 1,).
 
-    Args:
-        residuals: what the richest model leaves, one array for each log.
-        rows_per_freedom: rows over rows less fitted freedoms, by which a fit makes its residual too small.
+    A fit makes its residual too small by ``rows_per_freedom``: rows over rows less fitted freedoms.
     """
     total, count = np.zeros(ORDER + 1), 0
     for rest in residuals:

@@ -32,12 +32,7 @@ def nuisances(
 ) -> list[Term]:
     """All terms; those that are errors of a believed number carry the name of that effect.
 
-    Args:
-        nominal: the believed joint.
-        views: what columns are made of.
-        logs: the recordings themselves.
-        builder: takes the columns in.
-        estimated: ``inertia`` and ``friction`` where they were fitted to these logs.
+    ``estimated`` holds ``inertia`` and ``friction`` where they were fitted to these logs.
     """
     terms = []
     for name, deviation in _one_sigma(nominal).items():

@@ -22,12 +22,7 @@ def plainest(posterior: Posterior, draw: Draw, gram: Array) -> Draw:
 
     The form of each cause is right to a tenth of it. Where several curves, or some that mostly cancel, make together
     what an error of the believed curve makes, but for such a tenth, the recordings do not tell their shapes: the error
-    is the cause, and what it leaves has no name.
-
-    Args:
-        posterior: of a channel.
-        draw: one of its samples.
-        gram: mean products of the channel's columns, shape (m, m).
+    is the cause, and what it leaves has no name. ``gram`` holds mean products of the channel's columns, shape (m, m).
     """
     terms, known = posterior.terms(draw.model), len(posterior.channel.nuisances)
     parts = np.split(draw.values, np.cumsum([len(term.columns) for term in terms])[:-1])

@@ -35,21 +35,15 @@ LINE_SHARE = 0.1
 
 
 def plant_channel(
-    nominal: Nominal,
-    recordings: Sequence[Recording],
-    library: Collection[str],
+    nominal: Nominal,  # the believed joint
+    recordings: Sequence[Recording],  # all logs of the set
+    library: Collection[str],  # effects that may be used
+    # ``inertia`` and ``friction`` where they were fitted to these logs, so that they are free.
     estimated: Collection[str],
+    # The believed joint recorded as the same logs, where it can be simulated: what it shows is no gap.
     believed: Sequence[Recording] = (),
 ) -> Channel | None:
-    """The channel of a set; None where no log has a torque.
-
-    Args:
-        nominal: the believed joint.
-        recordings: all logs of the set.
-        library: effects that may be used.
-        estimated: ``inertia`` and ``friction`` where they were fitted to these logs, so that they are free.
-        believed: the believed joint recorded as the same logs, where it can be simulated: what it shows is no gap.
-    """
+    """The channel of a set; None where no log has a torque."""
     logs = [r for r in recordings if r.view is not None and r.plant_nm is not None]
     if not logs:
         return None

@@ -73,11 +73,7 @@ class Known:
 
 
 class Posterior:
-    """Scores of models of one channel.
-
-    Args:
-        channel: what is explained.
-        library: number of effects that may be used.
+    """Scores of models of one channel; ``library`` is the number of effects that may be used.
 
     Attributes:
         floor: RMS that noise alone leaves.
@@ -481,9 +477,7 @@ class Posterior:
     def believed(self, draw: Draw, squares: Array) -> dict[str, float]:
         """By cause: mean square of what it makes of the residual before anything is recorded.
 
-        Args:
-            draw: whose causes, under whose care of the belief.
-            squares: mean square of every column of the channel's table.
+        ``squares`` holds the mean square of every column of the channel's table.
         """
         care = self.settings[draw.setting].care
         terms = [(term, care) for term in self.channel.nuisances]
@@ -510,15 +504,7 @@ class Draw:
 
 
 def _put_inside(values: Array, root: Array, starts: np.ndarray, low: Array, high: Array) -> Array:
-    """Values put on the bounds that they lie beyond; what is like them follows, as their covariance has it.
-
-    Args:
-        values: drawn, shape (k,).
-        root: of their covariance, shape (k, k).
-        starts: which of them have bounds.
-        low: their bounds.
-        high: see there.
-    """
+    """Values put on the bounds that they lie beyond; what is like them follows as their covariance has it."""
     for _ in starts:
         beyond = np.maximum(low - values[starts], 0.0) - np.maximum(values[starts] - high, 0.0)
         worst = int(np.argmax(np.abs(beyond)))

@@ -229,23 +229,15 @@ def uniform(experiment: Experiment) -> tuple[Experiment, float, bool]:
 
 
 def view_of(
-    nominal: Nominal,
-    experiment: Experiment,
-    step_s: float,
-    start_s: float,
-    velocity: Array,
+    nominal: Nominal,  # the believed joint
+    experiment: Experiment,  # on a uniform clock
+    step_s: float,  # of that clock
+    start_s: float,  # of the experiment in its session
+    velocity: Array,  # rad/s, shape (n,)
+    # How late a row's torque is, in rows; half of the time that it has been applied unless given.
     late: float | None = None,
 ) -> View:
-    """What inverse forms see of one experiment.
-
-    Args:
-        nominal: the believed joint.
-        experiment: on a uniform clock.
-        step_s: of that clock.
-        start_s: of the experiment in its session.
-        velocity: rad/s, shape (n,).
-        late: how late a row's torque is, in rows; half of the time that it has been applied unless given.
-    """
+    """What inverse forms see of one experiment."""
     q = experiment.position_rad
     assert experiment.torque_nm is not None
     acceleration = np.zeros_like(q)
@@ -318,10 +310,7 @@ def friction_scales(nominal: Nominal) -> tuple[float, float]:
 def presliding_state(nominal: Nominal, position_rad: Array, stiffer: float = 1.0) -> Array:
     """State of the believed friction along a measured position, -1..1, from a relaxed start, shape (n,).
 
-    Args:
-        nominal: the believed joint; its form of presliding counts.
-        position_rad: measured.
-        stiffer: factor of its stiffness.
+    ``stiffer`` is a factor of its stiffness.
     """
     coulomb, stiffness = friction_scales(nominal)
     slip_per_rad = stiffer * stiffness / coulomb
@@ -362,29 +351,20 @@ def slip_state(position_rad: Array, slip_per_rad: float) -> Array:
 
 
 def controller_demand(
-    controller: Controller,
-    position_rad: Array,
-    command_rad: Array,
-    step_s: float,
+    controller: Controller,  # gains and limit
+    position_rad: Array,  # measured
+    command_rad: Array,  # commanded
+    step_s: float,  # sampling step
     *,
-    integral_nm: float = 0.0,
+    integral_nm: float = 0.0,  # level of the integral at the start
+    # What the controller takes as the velocity; the differenced position unless given.
     velocity_rad_s: Array | None = None,
-    velocity_lag_s: float = 0.0,
-    every_tick: bool = False,
+    velocity_lag_s: float = 0.0,  # an extra first-order lag of the velocity that the controller sees
+    every_tick: bool = False,  # the demand of every tick of the controller, not of the last one before each row
 ) -> Array:
     """The controller replayed on a measured position; in force when the next sample is taken, shape (n,).
 
     Where the log keeps every so many ticks of the controller, the motion between its rows is interpolated.
-
-    Args:
-        controller: gains and limit.
-        position_rad: measured.
-        command_rad: commanded.
-        step_s: sampling step.
-        integral_nm: level of the integral at the start.
-        velocity_rad_s: what the controller takes as the velocity; the differenced position unless given.
-        velocity_lag_s: an extra first-order lag of the velocity that the controller sees.
-        every_tick: the demand of every tick of the controller, not of the last one before each row.
     """
     ticks = ticks_of(controller, step_s)
     position, command = between(position_rad, ticks), between(command_rad, ticks)

@@ -47,21 +47,13 @@ class Verdict:
 
 
 def verdict(
-    found: Sequence[Finding],
-    channels: Sequence[Sampled],
-    gaps: Sequence[Closed],
-    negligible: float,
-    otherwise_quiet: bool,
+    found: Sequence[Finding],  # causes, the largest first
+    channels: Sequence[Sampled],  # draws of each channel
+    gaps: Sequence[Closed],  # of each channel
+    negligible: float,  # gap that means nothing to the user, in the channels' unit
+    otherwise_quiet: bool,  # the residual before any filter and the simulated closed loop show no more than noise
 ) -> Verdict:
-    """Decide.
-
-    Args:
-        found: causes, the largest first.
-        channels: draws of each channel.
-        gaps: of each channel.
-        negligible: gap that means nothing to the user, in the channels' unit.
-        otherwise_quiet: the residual before any filter and the simulated closed loop show no more than noise.
-    """
+    """Decide."""
     helpless = [g.channel for c, g in zip(channels, gaps, strict=True) if g.after > HELPS * g.before or _faint(c, g)]
     unreached = [f for f in found if f.size >= FLOORS and needed(f, channels) and _unreached(f, channels)]
     named = tuple(f for f in found if f.chance >= LISTED and (f.where not in helpless or f in unreached))

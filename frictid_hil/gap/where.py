@@ -57,13 +57,11 @@ class _Log:
 def where(
     recordings: Sequence[Recording], noise_nm: float, *, velocity_gain_nm_s_per_rad: float | None = None
 ) -> tuple[Where, ...]:
-    """Shares of the squared gap, the largest region first; empty without a residual to share out.
+    """Shares of the squared gap of all logs, the largest region first; empty without a residual to share out.
 
-    Args:
-        recordings: all logs of the set; nothing is fitted to form their residuals.
-        noise_nm: RMS that noise alone leaves in a low-passed residual; not counted.
-        velocity_gain_nm_s_per_rad: torque per velocity error of the loop, by which an error of the reported velocity is
-            weighed; the inertia times its rate of change where there is no controller.
+    RMS ``noise_nm``, that noise alone leaves in a low-passed residual, is not counted. An error of the reported
+    velocity is weighed by the loop's torque per velocity error; by the inertia times its rate of change where there is
+    no controller.
     """
     every = [r for r in recordings if r.plant_nm is not None and r.view is not None]
     if not every:
