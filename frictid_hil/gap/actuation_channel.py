@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.channel import Builder, Channel, Rows, Term
+from frictid_hil.gap.channel import Builder, Channel, Term, of_each_log, rows_of
 from frictid_hil.gap.command_timing import FASTEST, between_rows
 from frictid_hil.gap.experiment_set import Controller, Nominal, ReportFilter
-from frictid_hil.gap.plant_channel import BEYOND, SIZES, family, white_nm, without_nuisances
+from frictid_hil.gap.plant_channel import BEYOND, families_of, white_nm, without_nuisances
 from frictid_hil.gap.residuals import (
     LowPass,
     Recording,
@@ -103,19 +103,16 @@ def actuation_channel(
             numbers = builder.add(columns)
             spread, ends = (0.3, NEAREST) if form.late else (0.1, (-math.inf, math.inf))
             candidates.append(Term(name, value, numbers, np.ones(1), np.full(1, spread), *ends))
-    for name, columns in _generic(logs, base).items():
-        numbers = builder.add(columns)
-        candidates += [family(name, size * scale, numbers, columns) for size in SIZES]
-    low_pass = LowPass.at(1.0 / logs[0].step_s)
-    rows = tuple(
-        _rows(r, residuals[k], builder.parts[k], low_pass, nominal.torque_report_filter) for k, r in enumerate(logs)
-    )
+    candidates += families_of(_generic(logs, base), scale, builder)
+    low_pass, report = LowPass.at(1.0 / logs[0].step_s), nominal.torque_report_filter
+    told = zip(logs, builder.parts, residuals, strict=True)
+    rows = [rows_of(r, columns, residual, low_pass, report=report) for r, columns, residual in told]
     rows = without_nuisances(rows, nuisances, candidates)
     between = any(r.resampled or between_rows(controller, r.step_s) for r in logs)
     return Channel(
         "actuation",
         logs[0].step_s * low_pass.stride,
-        rows,
+        tuple(rows),
         tuple(nuisances),
         tuple(candidates),
         scale,
@@ -161,10 +158,7 @@ def _timing(nominal: Nominal, base: Sequence[Array], logs: Sequence[Recording], 
     report = nominal.torque_report_filter
     unsure_s = 0.5 * report.order * report.time_constant_s if report else 0.0
     numbers = builder.add(columns)
-    level: list[Array] = []
-    for k, b in enumerate(base):
-        level.append(np.zeros((b.size, len(base))))
-        level[-1][:, k] = 1.0
+    level = of_each_log([np.ones((b.size, 1)) for b in base])
     # The integral of the controller is unknown where a log begins.
     start = Term("", {}, builder.add(level), np.zeros(len(base)), np.full(len(base), rms(np.concatenate(base))))
     terms = [start, Term("torque_delay", {}, numbers, np.zeros(1), np.array([tolerances.torque_delay_s.of(0.0)]))]
@@ -279,25 +273,4 @@ def _residual(recording: Recording, asked_nm: Array, report: ReportFilter | None
     """Reported torque less the believed one, as the drive reports it, N m, shape (n,)."""
     torque = recording.experiment.torque_nm
     assert torque is not None
-    if report is not None:
-        asked_nm = reported(asked_nm[:, None], report, recording.step_s)[:, 0]
-    return settled(torque - asked_nm, recording.step_s)
-
-
-def _rows(
-    recording: Recording, residual_nm: Array, parts: list[Array], low_pass: LowPass, report: ReportFilter | None
-) -> Rows:
-    e = recording.experiment
-    columns = parts
-    if report is not None:
-        columns = [reported(block, report, recording.step_s) for block in columns]
-    table = low_pass.thinned_blocks([*columns, residual_nm[:, None]])[1:-2]
-    return Rows(
-        e.name,
-        e.validation,
-        recording.step_s * low_pass.stride,
-        table[:, -1],
-        table[:, :-1],
-        np.zeros(table.shape[0]),
-        np.ones(table.shape[0], dtype=bool),
-    )
+    return settled(torque - reported(asked_nm, report, recording.step_s), recording.step_s)

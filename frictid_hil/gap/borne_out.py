@@ -78,7 +78,7 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
 
 
 def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm: float, loop: Loop) -> set[str]:
-    """Causes that do harm: ``HALF`` of the visible gap, or ``REMAINS`` of it both beside the chosen ones and among all."""
+    """Causes that do harm: ``HALF`` of the visible gap, or ``REMAINS`` both beside the chosen ones and among all."""
     spared = {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
     added = {n: (nm**2 - gap_nm**2) / loop.visible for n, nm in beside.items() if n not in spared}
     refuted = {name for name, share in added.items() if share > HALF**2}

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.experiment_set import ReportFilter
+from frictid_hil.gap.residuals import LowPass, Recording, reported
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import Shape
 
@@ -88,6 +90,30 @@ class Builder:
             part.append(block)
         first, self.width = self.width, self.width + columns[0].shape[1]
         return tuple(range(first, self.width))
+
+
+def rows_of(
+    recording: Recording,
+    columns: Sequence[Array],
+    residual: Array,
+    low_pass: LowPass,
+    *,
+    first: int = 1,  # row that is told first, thinned
+    known_noise: Array | None = None,
+    report: ReportFilter | None = None,  # that columns and noise have still to pass
+) -> Rows:
+    """One log of a channel behind the low-pass."""
+    noise = np.zeros(residual.size) if known_noise is None else known_noise
+    blocks = [reported(block, report, recording.step_s) for block in (*columns, noise[:, None])]
+    table = low_pass.thinned_blocks([*blocks, residual[:, None]])[first:-2]
+    e, start_s = recording.experiment, first * low_pass.stride * recording.step_s
+    told = np.ones(table.shape[0], dtype=bool)
+    return Rows(e.name, e.validation, start_s, table[:, -1], table[:, :-2], table[:, -2], told)
+
+
+def of_each_log(columns: Sequence[Array]) -> list[Array]:
+    """Columns (n, k) of each log by itself, 0 in the others: shape (n, k * logs)."""
+    return [np.kron(np.eye(len(columns))[k], own) for k, own in enumerate(columns)]
 
 
 def effect_prior(

@@ -22,7 +22,7 @@ from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import Finding, Sampled, either_way, findings, sampled, whole_draws
 from frictid_hil.gap.forward import Effects, Replay, Replayed, settled_nm, why_not
 from frictid_hil.gap.how_far import Closed, Simulated, closed, held_out, simulated
-from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
+from frictid_hil.gap.kinematics import fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.position_noise import white_rms
@@ -32,7 +32,18 @@ from frictid_hil.gap.report_filter import as_meant
 from frictid_hil.gap.residuals import LowPass, Recording, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.tracking_channel import tracking_channel
-from frictid_hil.gap.verdict import DOUBTED, FLOORS, FLOORS_AS_STATED, HALF, Verdict, as_stated, needed, stays, verdict
+from frictid_hil.gap.verdict import (
+    DOUBTED,
+    FLOORS,
+    FLOORS_AS_STATED,
+    HALF,
+    READ_DIRECTLY,
+    Verdict,
+    as_stated,
+    needed,
+    stays,
+    verdict,
+)
 from frictid_hil.gap.where import lives, where
 from frictid_hil.simulation.effects import all_effects
 
@@ -99,7 +110,7 @@ def _channels(
     logs: Sequence[Recording],
     allowed: Sequence[str],
     reasons: dict[str, str],
-    kinematic: KinematicFit,
+    kinematic: Mapping[str, float],
     believed: Sequence[Recording],
 ) -> list[Channel]:
     """The channels that these recordings have."""
@@ -109,7 +120,7 @@ def _channels(
         reasons["forward_position_rad"] = "position against the command through a fitted chain, not a replay"
         tracking = tracking_channel(logs, allowed)
         return [] if tracking is None else [tracking]
-    actuation = actuation_channel(nominal, logs, allowed, {n: kinematic.read[n] for n in kinematic.found}, believed)
+    actuation = actuation_channel(nominal, logs, allowed, kinematic, believed)
     if actuation is None:
         reasons["actuation"] = why_not_replayed(nominal, logs) or "no log has torque and demand"
     return [plant] if actuation is None else [plant, actuation]
@@ -124,31 +135,26 @@ def _believed(experiments: ExperimentSet, replay: Replay | None) -> tuple[Record
 
 def _with_readings(
     found: list[Finding],
-    kinematic: KinematicFit,
+    kinematic: Mapping[str, float],
     logs: Sequence[Recording],
     channels: Sequence[Sampled],
     nominal: Nominal,
 ) -> list[Finding]:
     """The findings with what the kinematic channel reads directly."""
-    if not channels:
+    if not channels or not kinematic:
         return found
-    floor = channels[0].posterior.floor
-    for name, values in kinematic.found.items():
+    made = [r.kinematic_rad_s for r in logs if r.kinematic_rad_s is not None]
+    gain = nominal.controller.kd_nm_s_per_rad if nominal.controller is not None else 0.0
+    for name, value in kinematic.items():
         form = all_effects()[name].kinematic
         assert form is not None
-        made = [r.kinematic_rad_s for r in logs if r.kinematic_rad_s is not None]
-        gain = nominal.controller.kd_nm_s_per_rad if nominal.controller is not None else 0.0
-        size = gain * rms(np.concatenate(made)) / floor if made and not form.position_step else 1.0
-        told = {p: _exact(v) for p, v in values.items()}
+        size = (
+            gain * rms(np.concatenate(made)) / channels[0].posterior.floor if made and not form.position_step else 1.0
+        )
+        told = {form.parameter: Value(value, 0.95 * value, 1.05 * value)}
         others = [f for f in found if f.effect != name]
-        found = [*others, Finding(name, READ, max(size, 1.0), 0.0, told, (), "kinematics")]
-    if not kinematic.found:
-        return found
+        found = [*others, Finding(name, READ, max(size, 1.0), 0.0, told, (), READ_DIRECTLY)]
     return sorted(found, key=lambda f: -f.size)
-
-
-def _exact(value: float) -> Value:
-    return Value(value, 0.95 * value, 1.05 * value)
 
 
 def _negligible(nominal: Nominal, channels: Sequence[Sampled], share: float) -> float:

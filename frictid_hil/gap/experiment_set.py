@@ -26,6 +26,7 @@ from frictid_hil.gap.tolerances import Tolerances
 from frictid_hil.recording.csv import read_csv
 from frictid_hil.recording.samples import Samples
 from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.joint import Payload
 
 MAX_ROWS = 2_000_000  # rows of one log that are read; a longer one is refused with advice, not quietly cut
 
@@ -33,6 +34,7 @@ MAX_ROWS = 2_000_000  # rows of one log that are read; a longer one is refused w
 REST_SHARE = 1e-4  # a log whose travel is below this share of the longest one shows a joint at rest
 LONG_GAP_S = 0.25  # a gap from which a recording goes on as another log: nobody knows what the joint did meanwhile
 LEAST_PIECE_ROWS = 200  # shorter pieces between gaps are left out
+LOG_COLUMNS = ("time_s", *Samples.COLUMNS[:4], "rigid_body_torque_nm", "temperature_c", "torque_demand_nm")
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +85,6 @@ class ReportFilter:
 
     order: int
     time_constant_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Payload:
-    """A body mounted on the link for some experiments."""
-
-    inertia_kg_m2: float
-    gravity_cos_nm: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,13 +219,10 @@ def _without_long_gaps(log: Experiment, samples: Samples) -> list[Experiment]:
         replace(
             log,
             name=f"{log.name}, piece {k}" if len(stretches) > 1 else log.name,
-            **{name: c[part] for name in _LOG_COLUMNS if (c := getattr(log, name)) is not None},
+            **{name: c[part] for name in LOG_COLUMNS if (c := getattr(log, name)) is not None},
         )
         for k, part in enumerate(stretches, start=1)
     ]
-
-
-_LOG_COLUMNS = ("time_s", *Samples.COLUMNS[:4], "rigid_body_torque_nm", "temperature_c", "torque_demand_nm")
 
 
 _YIELDS = {"gradually": True, "at once": False, None: None}
@@ -330,7 +321,7 @@ def _curve(friction: config.Friction | None, where: str) -> FrictionCurve | None
 
 
 def _experiment(told: config.ExperimentFile, samples: Samples) -> Experiment:
-    columns = {name: getattr(samples, name) for name in _LOG_COLUMNS}
+    columns = {name: getattr(samples, name) for name in LOG_COLUMNS}
     role, order = told.role == "validation", told.run_order or 0
     return Experiment(name=told.name, validation=role, payload=told.payload, run_order=order, **columns)
 

@@ -16,7 +16,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.residuals import LowPass, between, first_slide, friction_scales, reported, rms, uniform
 from frictid_hil.simulation.effects import all_effects
-from frictid_hil.simulation.joint import Drive, Encoder, JointModel, Payload, ServoGains
+from frictid_hil.simulation.joint import Drive, Encoder, JointModel, ServoGains
 from frictid_hil.simulation.replay import CarryOver, Controller, Simulated, closed_loop
 
 Effects = Mapping[str, Mapping[str, float]]
@@ -58,7 +58,6 @@ def nominal_model(nominal: Nominal) -> JointModel:
     _, stiffness = friction_scales(nominal)
     rated = nominal.rated_torque_nm or 1.0
     quantum = nominal.torque_quantum_nm or 0.0
-    payload = nominal.payload
     return JointModel(
         inertia_kg_m2=nominal.inertia_kg_m2,
         motor_inertia_share=nominal.motor_inertia_share or 0.3,
@@ -74,7 +73,7 @@ def nominal_model(nominal: Nominal) -> JointModel:
         servo=ServoGains(
             nominal.controller.kp_nm_per_rad, nominal.controller.ki_nm_per_rad_s, nominal.controller.kd_nm_s_per_rad
         ),
-        payload=None if payload is None else Payload(payload.inertia_kg_m2, payload.gravity_cos_nm),
+        payload=nominal.payload,
     ).with_effects({**nominal.believed_effects, **_gradual(nominal)})
 
 
@@ -155,9 +154,7 @@ class Replay:
         exact = abs(self._controller.rate_hz * step_s / ticks - 1.0) < SAME_RATE
         controller = replace(self._controller, rate_hz=ticks / step_s) if exact else self._controller
         rows = closed_loop(model, controller, time, command, payload=e.payload, state=state)
-        torque = rows.torque_nm
-        if self._report is not None:
-            torque = reported(torque[:, None], self._report, float(np.median(np.diff(time))))[:, 0]
+        torque = reported(rows.torque_nm, self._report, float(np.median(np.diff(time))))
         return replace(
             rows,
             position_rad=rows.position_rad[::ticks],

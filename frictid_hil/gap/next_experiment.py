@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -113,10 +113,8 @@ def _along(nominal: Nominal, position_rad: Array, payload: bool, log: Recording)
     """What inverse forms see of the believed joint along a motion that it follows exactly."""
     time_s = log.step_s * np.arange(position_rad.size)
     bare = Experiment("next", False, payload, 0, time_s, position_rad, torque_nm=np.zeros(position_rad.size))
-    velocity = np.gradient(position_rad, log.step_s)
-    view = view_of(nominal, bare, log.step_s, 0.0, velocity, 0.0)
-    torque = Experiment("next", False, payload, 0, time_s, position_rad, torque_nm=nominal_torque(nominal, bare, view))
-    return view_of(nominal, torque, log.step_s, 0.0, velocity, 0.0)
+    view = view_of(nominal, bare, log.step_s, 0.0, 0.0)
+    return replace(view, torque_nm=nominal_torque(nominal, bare, view))
 
 
 def _columns(known: Known, view: View, low_pass: LowPass) -> Array:

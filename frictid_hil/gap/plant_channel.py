@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.channel import FAMILY, STIFFNESS, Builder, Channel, Rows, Term, effect_prior
+from frictid_hil.gap.channel import FAMILY, STIFFNESS, Builder, Channel, Rows, Term, effect_prior, of_each_log, rows_of
 from frictid_hil.gap.experiment_set import Nominal, ReportFilter
 from frictid_hil.gap.generic import WHOLE, families
 from frictid_hil.gap.noise import LOCAL_S
@@ -60,18 +60,20 @@ def plant_channel(
     candidates = _causes(library, views, measured, known, scale, builder)
     generic = families(views)
     if sum(not r.experiment.validation for r in logs) >= SEVERAL:
-        generic[EACH_LOG] = _by_log(views)
-    for name, columns in generic.items():
-        numbers = builder.add(columns)
-        for size in SIZES:
-            candidates.append(family(name, size * scale, numbers, columns))
+        generic[EACH_LOG] = of_each_log([np.stack([np.ones_like(v.slip), v.slip], axis=1) for v in views])
+    candidates += families_of(generic, scale, builder)
     low_pass = band(residuals, logs[0].step_s, candidates, builder.parts)
-    rows = tuple(_rows(r, residuals[k], builder.parts[k], noises[k], low_pass, report) for k, r in enumerate(logs))
-    rows = without_nuisances(rows, known, candidates)
+    rows = []
+    for r, v, residual, noise, columns in zip(logs, measured, residuals, noises, builder.parts, strict=True):
+        held = first_slide(v.position_rad, 3.0 * v.coulomb_nm / v.stiffness_nm_per_rad)
+        first = min(held // low_pass.stride + 1, len(range(0, residual.size, low_pass.stride)) // 3)
+        rows.append(rows_of(r, columns, residual, low_pass, first=first, known_noise=noise, report=report))
     step_s = logs[0].step_s * low_pass.stride
-    rows = _told(rows, white_nm(logs, low_pass), views[0].coulomb_nm, step_s)
+    rows = _told(without_nuisances(rows, known, candidates), white_nm(logs, low_pass), views[0].coulomb_nm, step_s)
     raw, known_floor = _raw(logs, residuals, noises), _known_floor(logs, rows, low_pass)
-    return Channel("plant", step_s, rows, tuple(known), tuple(candidates), scale, low_pass.cutoff_hz, raw, known_floor)
+    return Channel(
+        "plant", step_s, tuple(rows), tuple(known), tuple(candidates), scale, low_pass.cutoff_hz, raw, known_floor
+    )
 
 
 def _causes(
@@ -104,7 +106,13 @@ def _causes(
     return candidates
 
 
-def family(name: str, size: float, numbers: tuple[int, ...], columns: Sequence[Array]) -> Term:
+def families_of(generic: Mapping[str, Sequence[Array]], scale: float, builder: Builder) -> list[Term]:
+    """Families of generic functions by name, each at the sizes that it may have."""
+    numbers = {name: builder.add(columns) for name, columns in generic.items()}
+    return [_family(n, size * scale, numbers[n], columns) for n, columns in generic.items() for size in SIZES]
+
+
+def _family(name: str, size: float, numbers: tuple[int, ...], columns: Sequence[Array]) -> Term:
     """A family of generic functions whose sum has about the given size."""
     squares = sum(np.sum(block**2, axis=0) for block in columns)
     each = np.sqrt(squares / sum(block.shape[0] for block in columns))
@@ -134,7 +142,7 @@ def white_nm(logs: Sequence[Recording], low_pass: LowPass) -> float:
     return low_pass.white_gain * rms(np.array(white))
 
 
-def _told(rows: Sequence[Rows], white_nm: float, coulomb_nm: float, step_s: float) -> tuple[Rows, ...]:
+def _told(rows: Sequence[Rows], white_nm: float, coulomb_nm: float, step_s: float) -> list[Rows]:
     """The logs, those rows marked in which noise of the position is much louder than in most: of a stuck spring.
 
     A coarse encoder does not say how far a stuck joint has bent its spring, and so not which torque it asks for.
@@ -142,7 +150,7 @@ def _told(rows: Sequence[Rows], white_nm: float, coulomb_nm: float, step_s: floa
     window = np.full(round(LOCAL_S / step_s) + 1, 1.0) / (round(LOCAL_S / step_s) + 1)
     local = [np.sqrt(np.convolve(log.known_noise**2, window, mode="same") + white_nm**2) for log in rows]
     most_nm = max(SWAMPED * float(np.median(np.concatenate(local))), UNTOLD * coulomb_nm)
-    return tuple(replace(log, told=size <= most_nm) for log, size in zip(rows, local, strict=True))
+    return [replace(log, told=size <= most_nm) for log, size in zip(rows, local, strict=True)]
 
 
 def _gap_nm(residuals: Sequence[Array], step_s: float) -> float:
@@ -151,7 +159,7 @@ def _gap_nm(residuals: Sequence[Array], step_s: float) -> float:
     return rms(np.concatenate([low_pass(residual)[5:-5] for residual in residuals]))
 
 
-def without_nuisances(logs: Sequence[Rows], nuisances: Sequence[Term], candidates: Sequence[Term]) -> tuple[Rows, ...]:
+def without_nuisances(logs: Sequence[Rows], nuisances: Sequence[Term], candidates: Sequence[Term]) -> list[Rows]:
     """The logs with that part of generic functions taken off which the belief's own tolerances can say."""
     whole = (EACH_LOG, *WHOLE)
     known = [c for term in nuisances for c in term.columns]
@@ -164,18 +172,7 @@ def without_nuisances(logs: Sequence[Rows], nuisances: Sequence[Term], candidate
         table = log.x.copy()
         table[:, generic] -= log.x[:, known] @ weights
         result.append(replace(log, x=table))
-    return tuple(result)
-
-
-def _by_log(views: Sequence[View]) -> list[Array]:
-    """A constant and a friction level of each log by itself."""
-    blocks: list[Array] = []
-    for k, v in enumerate(views):
-        block: Array = np.zeros((v.slip.size, 2 * len(views)))
-        block[:, 2 * k] = 1.0
-        block[:, 2 * k + 1] = v.slip
-        blocks.append(block)
-    return blocks
+    return result
 
 
 def band(
@@ -190,12 +187,8 @@ def band(
     lines = [t for t in candidates if not t.effect.startswith(FAMILY) and _is_line(t.effect)]
     if len(usable) == 1 or not lines:
         return LowPass(rate, usable[0])
-    gained = []
     tables = [[_taken(part, t.columns) for part in parts] for t in lines]
-    for hertz in usable:
-        low_pass = LowPass(rate, hertz)
-        gained.append(max(_described(residuals, table, low_pass) for table in tables))
-    worth = [hertz for hertz, gain in zip(usable, gained, strict=True) if gain > LINE_SHARE]
+    worth = [h for h in usable if max(_described(residuals, table, LowPass(rate, h)) for table in tables) > LINE_SHARE]
     return LowPass(rate, next((h for h in usable if not worth or h > worth[-1]), usable[-1]))
 
 
@@ -234,35 +227,5 @@ def plant_residual(recording: Recording, report: ReportFilter | None) -> Array:
     """Reported torque less what the believed joint asks for, as the drive reports it, N m, shape (n,)."""
     view, plant = recording.view, recording.plant_nm
     assert view is not None and plant is not None
-    if report is None:
-        return plant
-    left: Array = view.torque_nm - reported((view.torque_nm - plant)[:, None], report, recording.step_s)[:, 0]
-    return left
-
-
-def _rows(
-    recording: Recording,
-    residual_nm: Array,
-    parts: list[Array],
-    noise_nm: Array,
-    low_pass: LowPass,
-    report: ReportFilter | None,
-) -> Rows:
-    view = recording.view
-    assert view is not None
-    columns = [*parts, noise_nm[:, None]]
-    if report is not None:
-        columns = [reported(block, report, recording.step_s) for block in columns]
-    table = low_pass.thinned_blocks([*columns, residual_nm[:, None]])
-    held = first_slide(view.position_rad, 3.0 * view.coulomb_nm / view.stiffness_nm_per_rad)
-    first = min(held // low_pass.stride + 1, table.shape[0] // 3)
-    table = table[first:-2]
-    return Rows(
-        recording.experiment.name,
-        recording.experiment.validation,
-        first * low_pass.stride * recording.step_s,
-        table[:, -1],
-        table[:, :-2],
-        table[:, -2],
-        np.ones(table.shape[0], dtype=bool),
-    )
+    asked = view.torque_nm - plant
+    return plant if report is None else view.torque_nm - reported(asked, report, recording.step_s)

@@ -37,9 +37,9 @@ def quiet_views(nominal: Nominal, logs: Sequence[Recording]) -> tuple[list[View]
         position_noise = max(white_rms(e.position_rad), step / math.sqrt(12.0))
         hertz = _cutoff_hz(e.position_rad, position_noise, log.step_s)
         smooth = replace(e, position_rad=LowPass(1.0 / log.step_s, hertz)(e.position_rad))
-        quiet = view_of(nominal, smooth, log.step_s, view.start_s, np.gradient(smooth.position_rad, log.step_s))
+        quiet = view_of(nominal, smooth, log.step_s, view.start_s)
         noisy = replace(e, position_rad=smooth.position_rad + position_noise * random.standard_normal(torque.size))
-        loud = view_of(nominal, noisy, log.step_s, view.start_s, np.gradient(noisy.position_rad, log.step_s))
+        loud = view_of(nominal, noisy, log.step_s, view.start_s)
         asked = nominal_torque(nominal, e, quiet)
         noises.append(nominal_torque(nominal, e, loud) - asked)
         noises[-1][[0, -1]] = 0.0
@@ -64,14 +64,15 @@ def _cutoff_hz(position_rad: Array, noise_rad: float, step_s: float) -> float:
 
 def white_rms(values: Array) -> float:
     """RMS of the white part of a column, by the median of its sixth differences, which no motion reaches."""
-    if values.size < 8:
-        return 0.0
-    return float(np.median(np.abs(np.diff(values, 6)))) / (0.6745 * math.sqrt(math.comb(12, 6)))
+    return _noise_rms(values, 6)
 
 
 def differenced_rms(values: Array) -> float:
     """RMS of the noise of a column that was made of a position differenced twice, as a rigid-body torque is."""
+    return math.sqrt(6.0) * _noise_rms(values, 4)
+
+
+def _noise_rms(values: Array, differences: int) -> float:
     if values.size < 8:
         return 0.0
-    white = float(np.median(np.abs(np.diff(values, 4)))) / (0.6745 * math.sqrt(math.comb(12, 6)))
-    return math.sqrt(6.0) * white
+    return float(np.median(np.abs(np.diff(values, differences)))) / (0.6745 * math.sqrt(math.comb(12, 6)))

@@ -11,6 +11,7 @@ parts differently makes every healthy joint look as if it had backlash.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,11 +21,11 @@ import numpy as np
 from numba import njit
 from scipy import interpolate, signal
 
-from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal, ReportFilter
+from frictid_hil.gap.experiment_set import LOG_COLUMNS, Controller, Experiment, ExperimentSet, Nominal, ReportFilter
 from frictid_hil.simulation.inverse import View
 from frictid_hil.simulation.inverse_loops import bent, lagged
+from frictid_hil.simulation.joint import Payload
 
 CUTOFF_HZ = 20.0  # low-pass of everything that is compared (zero phase, fourth order); lower where the sampling is slow
 
@@ -62,9 +63,7 @@ class LowPass:
     def __call__(self, columns: Array) -> Array:
         """Filtered along the first axis; shape unchanged."""
         b, a = _butterworth(self.rate_hz, self.cutoff_hz)
-        padding = min(15, columns.shape[0] - 1)
-        filtered: Array = signal.filtfilt(b, a, columns, axis=0, padlen=padding)
-        return filtered
+        return np.asarray(signal.filtfilt(b, a, columns, axis=0, padlen=min(15, columns.shape[0] - 1)))
 
     def thinned(self, columns: Array) -> Array:
         """Every ``stride``-th row of the filtered columns, by the filter's own impulse response: shape (m, k)."""
@@ -87,8 +86,7 @@ class LowPass:
     @property
     def white_gain(self) -> float:
         """RMS of filtered white noise of unit RMS."""
-        b, a = signal.butter(4, self.cutoff_hz / (0.5 * self.rate_hz))
-        _, response = signal.freqz(b, a, worN=2048)
+        _, response = signal.freqz(*_butterworth(self.rate_hz, self.cutoff_hz), worN=2048)
         return float(np.sqrt(np.mean(np.abs(response) ** 4)))
 
 
@@ -101,12 +99,10 @@ def _butterworth(rate_hz: float, cutoff_hz: float) -> tuple[Array, Array]:
 @functools.cache
 def impulse_response(rate_hz: float, cutoff_hz: float) -> Array:
     """Of the low-pass forwards and backwards, centred, shape (taps,)."""
-    b, a = signal.butter(4, cutoff_hz / (0.5 * rate_hz))
     half = int(3.0 * rate_hz / cutoff_hz)
     pulse = np.zeros(4 * half + 1)
     pulse[2 * half] = 1.0
-    response: Array = signal.filtfilt(b, a, pulse)[half : 3 * half + 1]
-    return response
+    return np.asarray(signal.filtfilt(*_butterworth(rate_hz, cutoff_hz), pulse)[half : 3 * half + 1])
 
 
 @njit(cache=True)
@@ -128,13 +124,11 @@ def rms(values: Array) -> float:
 
 def recordings(experiments: ExperimentSet) -> tuple[Recording, ...]:
     """All experiments of a set with their residuals, in run order."""
-    result = []
-    start_s = 0.0
     late = _late_of_row(experiments)
-    for experiment in experiments.experiments:
-        result.append(_recording(experiments.nominal, experiment, start_s, late))
-        start_s += float(experiment.time_s[-1] - experiment.time_s[0])
-    return tuple(result)
+    lengths_s = [float(e.time_s[-1] - e.time_s[0]) for e in experiments.experiments]
+    starts_s = itertools.accumulate(lengths_s, initial=0.0)
+    logs = zip(experiments.experiments, starts_s, strict=False)
+    return tuple(_recording(experiments.nominal, e, start_s, late) for e, start_s in logs)
 
 
 def _late_of_row(experiments: ExperimentSet) -> float | None:
@@ -152,14 +146,12 @@ def _late_of_row(experiments: ExperimentSet) -> float | None:
         if raw.torque_nm is None:
             continue
         e, step_s, _ = uniform(raw)
-        view = view_of(nominal, e, step_s, 0.0, np.gradient(e.position_rad, step_s), 0.0)
+        view = view_of(nominal, e, step_s, 0.0, 0.0)
         low_pass = LowPass.at(1.0 / step_s)
         parts = [view.acceleration_rad_s2, view.slip, view.velocity_rad_s, np.cos(e.position_rad)]
         rigid = e.rigid_body_torque_nm
         model = np.stack([*parts, np.ones_like(view.slip), *([] if rigid is None else [rigid])], axis=1)
-        if nominal.torque_report_filter is not None:
-            model = reported(model, nominal.torque_report_filter, step_s)
-        model = low_pass(model)[5:-5]
+        model = low_pass(reported(model, nominal.torque_report_filter, step_s))[5:-5]
         torque = low_pass(np.stack([aligned(view.torque_nm, late) for late in LATE], axis=1))[5:-5]
         weights = np.linalg.lstsq(model, torque, rcond=None)[0]
         left += np.sum((torque - model @ weights) ** 2, axis=0)
@@ -173,8 +165,10 @@ def aligned(torque_nm: Array, late: float) -> Array:
     return torque
 
 
-def reported(columns: Array, report: ReportFilter, step_s: float) -> Array:
-    """Columns as a drive reports them that low-passes its torque, shape unchanged."""
+def reported(columns: Array, report: ReportFilter | None, step_s: float) -> Array:
+    """Columns as a drive reports them that low-passes its torque, or not; shape unchanged."""
+    if report is None:
+        return columns
     share = 1.0 - math.exp(-step_s / report.time_constant_s)
     for _ in range(report.order):
         start = (1.0 - share) * columns[:1]
@@ -185,15 +179,13 @@ def reported(columns: Array, report: ReportFilter, step_s: float) -> Array:
 def _recording(nominal: Nominal, raw: Experiment, start_s: float, late: float | None) -> Recording:
     experiment, step_s, resampled = uniform(raw)
     q = experiment.position_rad
-    velocity = np.gradient(q, step_s)
-    demand = actuation = kinematic = plant = None
-    view = None
+    view = demand = actuation = kinematic = plant = None
     if experiment.torque_demand_nm is not None:
         demand = experiment.torque_demand_nm
     elif nominal.controller is not None and experiment.position_command_rad is not None:
         demand = demand_of(nominal.controller, experiment, step_s)
     if experiment.torque_nm is not None:
-        view = view_of(nominal, experiment, step_s, start_s, velocity, late)
+        view = view_of(nominal, experiment, step_s, start_s, late)
         plant = view.torque_nm - nominal_torque(nominal, experiment, view)
         # The ends have no second difference.
         plant[0], plant[-1] = plant[1], plant[-2]
@@ -214,15 +206,7 @@ def uniform(experiment: Experiment) -> tuple[Experiment, float, bool]:
     time = np.arange(experiment.time_s[0], experiment.time_s[-1], step_s)
     columns: dict[str, Any] = {
         name: interpolate.make_interp_spline(experiment.time_s, column, k=3)(time)
-        for name in (
-            "position_rad",
-            "velocity_rad_s",
-            "torque_nm",
-            "position_command_rad",
-            "rigid_body_torque_nm",
-            "temperature_c",
-            "torque_demand_nm",
-        )
+        for name in LOG_COLUMNS[1:]
         if (column := getattr(experiment, name)) is not None
     }
     return replace(experiment, time_s=time, **columns), step_s, True
@@ -233,7 +217,6 @@ def view_of(
     experiment: Experiment,  # on a uniform clock
     step_s: float,  # of that clock
     start_s: float,  # of the experiment in its session
-    velocity: Array,  # rad/s, shape (n,)
     # How late a row's torque is, in rows; half of the time that it has been applied unless given.
     late: float | None = None,
 ) -> View:
@@ -242,18 +225,21 @@ def view_of(
     assert experiment.torque_nm is not None
     acceleration = np.zeros_like(q)
     acceleration[1:-1] = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / step_s**2
-    torque = aligned(experiment.torque_nm, 0.5 * applied_s(nominal, step_s) / step_s if late is None else late)
+    if late is None:
+        # A log that keeps every fifth tick of its controller keeps that tick's torque, applied since then.
+        applied_s = step_s if nominal.controller is None else min(step_s, 1.0 / nominal.controller.rate_hz)
+        late = 0.5 * applied_s / step_s
+    torque = aligned(experiment.torque_nm, late)
     inertia = nominal.inertia_kg_m2 or 0.0
     motor = inertia * (nominal.motor_inertia_share or 0.0)
-    payload = nominal.payload if experiment.payload else None
-    payload_inertia = payload.inertia_kg_m2 if payload is not None else 0.0
-    payload_cos = payload.gravity_cos_nm if payload is not None else 0.0
-    cos, sin = np.cos(q), np.sin(q)
+    payload = (nominal.payload if experiment.payload else None) or Payload(0.0, 0.0)
+    payload_cos = payload.gravity_cos_nm
+    cos, sin, velocity = np.cos(q), np.sin(q), np.gradient(q, step_s)
     gravity = nominal.gravity_cos_nm * cos + nominal.gravity_sin_nm * sin
     coulomb, stiffness = friction_scales(nominal)
     # The load's magnitude enters: the encoder's noise in the acceleration would count as load.
     smooth = LowPass.at(1.0 / step_s)(acceleration)
-    load = gravity + payload_cos * cos + (inertia - motor + payload_inertia) * smooth
+    load = gravity + payload_cos * cos + (inertia - motor + payload.inertia_kg_m2) * smooth
     if experiment.rigid_body_torque_nm is not None:
         load = experiment.rigid_body_torque_nm
     return View(
@@ -273,22 +259,12 @@ def view_of(
         stiffness_nm_per_rad=stiffness,
         motor_inertia_kg_m2=motor,
         link_inertia_kg_m2=inertia - motor,
-        payload_inertia_kg_m2=payload_inertia,
+        payload_inertia_kg_m2=payload.inertia_kg_m2,
         gear_ratio=nominal.gear_ratio or 1.0,
         gravity_cos_nm=nominal.gravity_cos_nm + payload_cos,
         gravity_sin_nm=nominal.gravity_sin_nm,
         gradual_rad=coulomb / stiffness if nominal.yields_gradually else 0.0,
     )
-
-
-def applied_s(nominal: Nominal, step_s: float) -> float:
-    """How long a row's torque has been applied: since the row before, or since the control tick before the row.
-
-    A log that keeps every fifth tick of its controller keeps that tick's torque.
-    """
-    if nominal.controller is None:
-        return step_s
-    return min(step_s, 1.0 / nominal.controller.rate_hz)
 
 
 def first_slide(position_rad: Array, travel_rad: float) -> int:
@@ -314,10 +290,8 @@ def presliding_state(nominal: Nominal, position_rad: Array, stiffer: float = 1.0
     """
     coulomb, stiffness = friction_scales(nominal)
     slip_per_rad = stiffer * stiffness / coulomb
-    if nominal.yields_gradually:
-        state: Array = bent(position_rad, 1.0 / slip_per_rad)
-        return state
-    return slip_state(position_rad, slip_per_rad)
+    gradual = nominal.yields_gradually
+    return np.asarray(bent(position_rad, 1.0 / slip_per_rad) if gradual else slip_state(position_rad, slip_per_rad))
 
 
 def nominal_torque(nominal: Nominal, experiment: Experiment, view: View) -> Array:
@@ -327,17 +301,8 @@ def nominal_torque(nominal: Nominal, experiment: Experiment, view: View) -> Arra
     else:
         inertia = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2 + view.payload_inertia_kg_m2
         rigid = inertia * view.acceleration_rad_s2 + view.gravity_nm + view.payload_gravity_nm
-    friction = friction_torque(nominal.curve, view.slip, view.rate_nm)
-    total: Array = rigid + friction
-    return total
-
-
-def friction_torque(curve: FrictionCurve | None, slip: Array, rate_nm: Array) -> Array:
-    """F_0 s + phi_0(v), 0 without a curve."""
-    if curve is None:
-        return np.zeros_like(slip)
-    torque: Array = curve.coulomb_nm * slip + rate_nm
-    return torque
+    # F_0 s + phi_0(v), 0 without a curve.
+    return rigid + (0.0 if nominal.curve is None else view.coulomb_nm * view.slip + view.rate_nm)
 
 
 @njit(cache=True)
@@ -408,17 +373,10 @@ def between(column: Array, ticks: int) -> Array:
 
 def demand_parts(controller: Controller, position_rad: Array, command_rad: Array, step_s: float) -> Array:
     """Proportional, integral and derivative part of the demand, (n, 3); the integral from 0, the limit left out."""
-    parts = []
-    for gain in ("kp_nm_per_rad", "ki_nm_per_rad_s", "kd_nm_s_per_rad"):
-        others = {"kp_nm_per_rad": 0.0, "ki_nm_per_rad_s": 0.0, "kd_nm_s_per_rad": 0.0}
-        alone = replace(
-            controller,
-            torque_limit_nm=math.inf,
-            feedforward=None,
-            **{**others, gain: getattr(controller, gain)},
-        )
-        parts.append(controller_demand(alone, position_rad, command_rad, step_s))
-    return np.stack(parts, axis=1)
+    gains = {name: getattr(controller, name) for name in ("kp_nm_per_rad", "ki_nm_per_rad_s", "kd_nm_s_per_rad")}
+    off = dict.fromkeys(gains, 0.0)
+    alone = (replace(controller, torque_limit_nm=math.inf, feedforward=None, **{**off, n: k}) for n, k in gains.items())
+    return np.stack([controller_demand(one, position_rad, command_rad, step_s) for one in alone], axis=1)
 
 
 @njit(cache=True)
@@ -442,12 +400,12 @@ def held(demand_nm: Array) -> Array:
 
 def settled(residual_nm: Array, step_s: float) -> Array:
     """The residual less its level over the first half second (what is left of the integral's unknown start)."""
-    shifted: Array = residual_nm - np.median(residual_nm[1 : start_rows(residual_nm, step_s)])
+    shifted: Array = residual_nm - np.median(residual_nm[1 : _start_rows(residual_nm, step_s)])
     shifted[0] = 0.0
     return shifted
 
 
-def start_rows(values: Array, step_s: float) -> int:
+def _start_rows(values: Array, step_s: float) -> int:
     """Rows of the first half second, at least a few."""
     return min(values.size, max(8, int(SETTLED_S / step_s)))
 
@@ -468,7 +426,7 @@ def demand_of(
     q, command = experiment.position_rad, experiment.position_command_rad
     level = 0.0
     if experiment.torque_nm is not None:
-        rows = start_rows(q, step_s)
+        rows = _start_rows(q, step_s)
         free = controller_demand(
             replace(controller, torque_limit_nm=math.inf),
             q[:rows],

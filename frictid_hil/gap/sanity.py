@@ -10,7 +10,7 @@ import numpy as np
 from frictid_hil.errors import InputFileError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
+from frictid_hil.gap.experiment_set import LOG_COLUMNS, Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.residuals import LowPass, controller_demand, friction_scales, rms, slip_state, uniform
 
 LARGEST_POSITION_RAD = 60.0
@@ -24,10 +24,6 @@ SLOWEST_STEP_S = 0.2  # sampling steps longer than this are more likely in milli
 OTHER_UNIT = 20.0
 """Factor between what a nominal joint or its controller asks for and what was measured that no joint explains."""
 LONGEST_HALT = 0.25  # part of a log in which a position may repeat itself far from its command
-
-_COLUMNS = (
-    "time_s", "position_rad", "velocity_rad_s", "torque_nm", "position_command_rad", "rigid_body_torque_nm",
-)  # fmt: skip
 
 
 def checked(experiments: ExperimentSet) -> ExperimentSet:
@@ -54,7 +50,7 @@ def _check(e: Experiment, nominal: Nominal) -> None:
     where = e.name
     if e.time_s.size < LEAST_ROWS:
         raise InputFileError(f"{e.time_s.size} rows; a diagnosis needs at least {LEAST_ROWS}", where=where)
-    for name in _COLUMNS:
+    for name in LOG_COLUMNS[:6]:  # a temperature or a demand may stand still
         column = getattr(e, name)
         if column is None:
             continue

@@ -8,8 +8,8 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.channel import Builder, Channel, Rows, Term
-from frictid_hil.gap.plant_channel import SIZES, family
+from frictid_hil.gap.channel import Builder, Channel, Term, of_each_log, rows_of
+from frictid_hil.gap.plant_channel import families_of
 from frictid_hil.gap.residuals import LowPass, Recording, rms
 from frictid_hil.simulation.drive_form import Link, TrackingForm
 from frictid_hil.simulation.effects import all_effects
@@ -40,32 +40,15 @@ def tracking_channel(recordings: Sequence[Recording], library: Collection[str]) 
         best = min((_left(changed, logs), k) for k, (_, changed) in enumerate(tried)) if tried else None
         if best is not None and not form.mimics and best[0] < 0.9 * _left(base, logs):
             base = list(tried[best[1]][1])
-    level: list[Array] = [np.zeros((b.size, len(base))) for b in base]
-    for k, one in enumerate(level):
-        one[:, k] = 1.0
+    level = of_each_log([np.ones((b.size, 1)) for b in base])
     start = Term("", {}, builder.add(level), np.zeros(len(base)), np.full(len(base), travel))
     scale = _left(commands, logs)
-    for name, shapes in _generic(logs, commands).items():
-        numbers = builder.add(shapes)
-        candidates += [family(name, size * scale, numbers, shapes) for size in SIZES]
+    candidates += families_of(_generic(logs, commands), scale, builder)
     low_pass = LowPass.at(1.0 / logs[0].step_s)
-    rows = []
-    for k, (log, command) in enumerate(zip(logs, commands, strict=True)):
-        residual = (log.experiment.position_rad - command)[:, None]
-        table = low_pass.thinned_blocks([*builder.parts[k], residual])[1:-2]
-        e = log.experiment
-        quiet, told = np.zeros(table.shape[0]), np.ones(table.shape[0], dtype=bool)
-        rows.append(Rows(e.name, e.validation, log.step_s, table[:, -1], table[:, :-1], quiet, told))
-    return Channel(
-        "tracking",
-        logs[0].step_s * low_pass.stride,
-        tuple(rows),
-        (start,),
-        tuple(candidates),
-        scale,
-        low_pass.cutoff_hz,
-        (0.0, 0.0),
-    )
+    told = zip(logs, builder.parts, commands, strict=True)
+    rows = tuple(rows_of(r, columns, r.experiment.position_rad - c, low_pass) for r, columns, c in told)
+    step_s = logs[0].step_s * low_pass.stride
+    return Channel("tracking", step_s, rows, (start,), tuple(candidates), scale, low_pass.cutoff_hz)
 
 
 def _tried(
@@ -102,8 +85,8 @@ def _left(positions: Sequence[Array], logs: Sequence[Recording]) -> float:
 
 def _generic(logs: Sequence[Recording], commands: Sequence[Array]) -> dict[str, list[Array]]:
     """Functions of the command that no effect names; those of its place alone would be a gain by another name."""
-    motion = []
-    for log, command in zip(logs, commands, strict=True):
-        velocity = LowPass.at(1.0 / log.step_s)(np.gradient(command, log.step_s))
-        motion.append(np.stack([np.abs(velocity), np.sign(velocity), np.gradient(velocity, log.step_s)], axis=1))
-    return {"motion": motion}
+    rates = [
+        (LowPass.at(1.0 / log.step_s)(np.gradient(command, log.step_s)), log.step_s)
+        for log, command in zip(logs, commands, strict=True)
+    ]
+    return {"motion": [np.stack([np.abs(v), np.sign(v), np.gradient(v, step_s)], axis=1) for v, step_s in rates]}

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal, Payload
+from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.forward import nominal_model
+from frictid_hil.simulation.joint import Payload
 from frictid_hil.simulation.replay import Controller as Loop
 from frictid_hil.simulation.replay import closed_loop
 
