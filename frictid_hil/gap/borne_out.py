@@ -90,9 +90,7 @@ def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm
     return refuted | {n for n, nm in without.items() if all_nm**2 - nm**2 > REMAINS**2 * loop.visible}
 
 
-def _rescued(
-    said: Verdict, values: Mapping[str, Mapping[str, float]], loop: Loop, gap_nm: float
-) -> tuple[Verdict, str | None]:
+def _rescued(said: Verdict, values: Effects, loop: Loop, gap_nm: float) -> tuple[Verdict, str | None]:
     """A first cause that lets the link swing may close the loop, although its columns lose the link's phase."""
     first, closer_nm = _refined(said.named[0], {said.named[0].effect: values[said.named[0].effect]}, loop, gap_nm)
     if first is said.named[0] or closer_nm**2 - loop.floor_nm**2 > UNNAMED**2 * loop.visible:
@@ -112,7 +110,7 @@ def _of_the_drive(cause: Finding) -> bool:
 
 
 def _chosen(
-    values: Mapping[str, Mapping[str, float]], rivals: Mapping[str, Sequence[str]], loop: Loop
+    values: Effects, rivals: Mapping[str, Sequence[str]], loop: Loop
 ) -> tuple[list[str], float, dict[str, float]]:
     """(causes that help, the best first; the gap with them; the gap with each of the others beside them).
 
@@ -124,22 +122,19 @@ def _chosen(
         others, left_nm = _taken_off(values, loop)
         if gap_nm**2 - left_nm**2 > REMAINS**2 * loop.visible:
             kept, gap_nm = others, left_nm
-    beside = {name: loop.gap_nm(_with(name, kept, values, rivals)) for name in values if name not in kept}
+    beside = {}
+    for name in values:
+        if name not in kept:
+            others = [n for n in kept if not _rival(n, name, rivals)]
+            beside[name] = loop.gap_nm({n: values[n] for n in (*others, name)})
     return kept, gap_nm, beside
-
-
-def _with(name: str, kept: Sequence[str], values: Effects, rivals: Mapping[str, Sequence[str]]) -> Effects:
-    """A cause and those of the kept ones that are no rivals of it."""
-    return {n: values[n] for n in (*(n for n in kept if not _rival(n, name, rivals)), name)}
 
 
 def _rival(one: str, other: str, rivals: Mapping[str, Sequence[str]]) -> bool:
     return one in rivals[other] or other in rivals[one]
 
 
-def _added(
-    values: Mapping[str, Mapping[str, float]], rivals: Mapping[str, Sequence[str]], loop: Loop
-) -> tuple[list[str], float]:
+def _added(values: Effects, rivals: Mapping[str, Sequence[str]], loop: Loop) -> tuple[list[str], float]:
     """(causes added one by one, the one that helps most first; the gap with them)."""
     kept: list[str] = []
     gap_nm = loop.before_nm
@@ -153,7 +148,7 @@ def _added(
         gap_nm = beside[best]
 
 
-def _taken_off(values: Mapping[str, Mapping[str, float]], loop: Loop) -> tuple[list[str], float]:
+def _taken_off(values: Effects, loop: Loop) -> tuple[list[str], float]:
     """(all causes less those without which the joint is nearer, in the order given; the gap with them)."""
     kept = list(values)
     gap_nm = loop.gap_nm(values)

@@ -67,6 +67,11 @@ class Channel:
     between_rows: bool = False
 
     @property
+    def level_free(self) -> bool:
+        """The level of a log is free but along the motion, so that a constant there is no size."""
+        return self.name != "plant"
+
+    @property
     def fitted(self) -> tuple[Rows, ...]:
         """The identification logs; all where there are none."""
         return tuple(log for log in self.logs if not log.validation) or self.logs

@@ -21,7 +21,7 @@ from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment,
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import Finding, Sampled, either_way, findings, sampled, whole_draws
 from frictid_hil.gap.forward import Effects, Replay, Replayed, settled_nm, why_not
-from frictid_hil.gap.how_far import Closed, Simulated, closed, held_out, simulated
+from frictid_hil.gap.how_far import Closed, closed, held_out, simulated
 from frictid_hil.gap.kinematics import fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.plant_channel import plant_channel
@@ -269,9 +269,11 @@ def _told(
         reasons.setdefault("forward_position_rad", reasons["forward_torque_nm"])
     effects = {f.effect: {n: v.value for n, v in f.parameters.items()} for f in said.named if f.chance >= UNDECIDED}
     applied = said.word == "explained"
-    runs = None
+    runs: dict[str, Mapping[str, Replayed]] = {}
     if replay is not None and bare is not None:
-        runs = simulated(replay, bare, effects if applied else {}, _judged_role(logs))
+        runs = {"before": bare, "after": bare}
+        if applied and effects:
+            runs["after"] = replay(effects, validation=_judged_role(logs))
     before, after, floor = _figures(gaps, runs, applied)
     gain = experiments.nominal.controller.kd_nm_s_per_rad if experiments.nominal.controller is not None else None
     places = where(logs, floor.inverse_nm or 0.0, velocity_gain_nm_s_per_rad=gain)
@@ -286,7 +288,9 @@ def _told(
         before=before,
         after=after,
         noise_floor=floor,
-        per_log=runs.per_log() if runs is not None else {},
+        per_log={
+            log: {when: Figures(None, *simulated({log: run[log]})) for when, run in runs.items()} for log in bare or ()
+        },
         next_experiment=_next(said, experiments.nominal, logs, channels),
         reasons=reasons,
         summary=_summary(experiments.name, said, lives(places), gaps, reasons.get("closed_loop")),
@@ -299,14 +303,14 @@ def _told(
     )
 
 
-def _figures(gaps: Sequence[Closed], runs: Simulated | None, applied: bool) -> tuple[Figures, Figures, Figures]:
+def _figures(
+    gaps: Sequence[Closed], runs: Mapping[str, Mapping[str, Replayed]], applied: bool
+) -> tuple[Figures, Figures, Figures]:
     """(before, after, noise floor)."""
-    inverse = next((g for g in gaps if g.channel == "plant"), None)
-    tracking = next((g for g in gaps if g.channel == "tracking"), None)
-    actuation = next((g for g in gaps if g.channel == "actuation"), None)
+    inverse, tracking, actuation = ({g.channel: g for g in gaps}.get(n) for n in ("plant", "tracking", "actuation"))
     forward: dict[str, tuple[float | None, float | None]] = {"before": (None, None), "after": (None, None)}
-    if runs is not None:
-        forward = {when: runs.figures(when) for when in ("before", "after")}
+    if runs:
+        forward |= {when: simulated(run) for when, run in runs.items()}
     elif tracking is not None:
         forward = {"before": (None, tracking.before), "after": (None, tracking.after)}
     if not applied:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -13,7 +14,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, STIFFNESS, Term
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.plainest import CANCELS, plainest
-from frictid_hil.gap.posterior import FORM, Draw, Posterior
+from frictid_hil.gap.posterior import FORM, Draw, Posterior, by_term, joined
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -61,20 +62,17 @@ class Sampled:
 
 def sampled(posterior: Posterior) -> Sampled:
     """Draws with the sizes of their causes, over all logs of the channel."""
-    # The level of a log is free but along the motion, so that a constant there is no size.
-    levels = float(posterior.channel.name != "plant")
+    levels = float(posterior.channel.level_free)
     x = np.concatenate([log.x[log.told] - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
     draws = [plainest(posterior, draw, gram) for draw in posterior.draws(posterior.search(), DRAWS)]
-    sizes: dict[str, Array] = {}
-    blurs: dict[str, Array] = {}
-    believed: dict[str, Array] = {}
+    sizes, blurs, believed = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(3))
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
 
     def size_of(parts: Sequence[tuple[np.ndarray, Array]]) -> float:
         if not parts:
             return 0.0
-        columns, values = np.concatenate([c for c, _ in parts]), np.concatenate([v for _, v in parts])
+        columns, values = joined(parts)
         square = float(values @ gram[np.ix_(columns, columns)] @ values)
         return math.sqrt(max(0.0, square)) / posterior.floor
 
@@ -84,10 +82,10 @@ def sampled(posterior: Posterior) -> Sampled:
         # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
         unnamed = [parts[""]] if "" in parts else []
         for effect, net, blur in zip(causes, *_net([*causes.values(), *unnamed], gram), strict=False):
-            sizes.setdefault(effect, np.zeros(len(draws)))[k] = net / posterior.floor
-            blurs.setdefault(effect, np.zeros(len(draws)))[k] = blur / posterior.floor
+            sizes[effect][k] = net / posterior.floor
+            blurs[effect][k] = blur / posterior.floor
         for effect, square in posterior.believed(draw, np.diag(gram)).items():
-            believed.setdefault(effect, np.zeros(len(draws)))[k] = math.sqrt(square) / posterior.floor
+            believed[effect][k] = math.sqrt(square) / posterior.floor
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
     return Sampled(posterior, draws, sizes, blurs, believed, generic, explained, gram)
@@ -101,9 +99,7 @@ def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array,
     """
     if not parts:
         return np.zeros(0), np.zeros(0)
-    vectors = np.zeros((len(parts), gram.shape[0]))
-    for k, (columns, values) in enumerate(parts):
-        np.add.at(vectors[k], columns, values)
+    vectors = np.stack([np.bincount(columns, values, gram.shape[0]) for columns, values in parts])
     inner = vectors @ gram @ vectors.T
     squares = np.maximum(np.diag(inner), 1e-300)
     own = np.sqrt(squares)
@@ -119,7 +115,7 @@ def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array,
 
 def findings(channels: Sequence[Sampled]) -> list[Finding]:
     """All causes of all channels, the one that is expected to make most first."""
-    names = _names(channels)
+    names = sorted({name for channel in channels for name in channel.sizes})
     if not names:
         return []
     table = np.array([_over_channels("sizes", name, channels) for name in names])
@@ -150,15 +146,11 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
 def either_way(channels: Sequence[Sampled]) -> list[str]:
     """Errors of the belief that are likely to show, as well one way as the other; first what others pass for most."""
     blurs = {}
-    for name in _names(channels):
+    for name in sorted({name for channel in channels for name in channel.sizes}):
         told, other = _sides(name, channels)
         if told < SIDED * (told + other) and told + other >= EVEN:
             blurs[name] = rms(_over_channels("blurs", name, channels))
     return sorted(blurs, key=lambda name: -blurs[name])
-
-
-def _names(channels: Sequence[Sampled]) -> list[str]:
-    return sorted({name for channel in channels for name in channel.sizes})
 
 
 def _over_channels(what: str, name: str, channels: Sequence[Sampled]) -> Array:
@@ -238,22 +230,18 @@ def whole_draws(effects: Sequence[str], channels: Sequence[Sampled]) -> tuple[di
 
 
 def _of_draw(effect: str, channels: Sequence[Sampled], k: int) -> dict[str, float]:
-    joined: dict[str, float] = {}
+    told: dict[str, float] = {}
     for channel in channels:
         for name, value in parameters(effect, channel, channel.draws[k]).items():
-            joined[name] = joined.get(name, 0.0) + value if name in joined else value
-    return joined
+            told[name] = told.get(name, 0.0) + value
+    return told
 
 
 def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
     """The parameters of an effect in one draw; empty where it is not in, or only within its tolerance's shape."""
     posterior = channel.posterior
-    at, found = 0, []
-    for term in posterior.terms(draw.model):
-        values = draw.values[at : at + len(term.columns)]
-        at += len(term.columns)
-        if term.effect == effect and STIFFNESS not in term.shape:
-            found.append((term, values))
+    terms = by_term(posterior.terms(draw.model), draw.values)
+    found = [(t, values) for t, values in terms if t.effect == effect and STIFFNESS not in t.shape]
     if not found:
         return {}
     if _opposed([(term, values) for term, values in found if term.shape]):
@@ -273,10 +261,8 @@ def _opposed(shaped: Sequence[tuple[Term, Array]]) -> bool:
 
 def _nearest(effect: str, channel: Sampled, found: Sequence[tuple[Term, Array]]) -> tuple[Term, Array]:
     """The one shape of a cause, and its coefficient, that comes nearest to what several make together."""
-    together = np.zeros(channel.gram.shape[0])
-    for term, values in found:
-        np.add.at(together, np.array(term.columns), values)
-    made = channel.gram @ together
+    columns, values = joined([(np.array(term.columns), values) for term, values in found])
+    made = channel.gram @ np.bincount(columns, values, channel.gram.shape[0])
     shapes = [t for t in channel.posterior.channel.candidates if t.effect == effect and len(t.columns) == 1]
     at = np.array([t.columns[0] for t in shapes])
     own = np.maximum(channel.gram[at, at], 1e-300)

@@ -10,10 +10,9 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, Rows
-from frictid_hil.gap.diagnosis import Figures
 from frictid_hil.gap.findings import Sampled
-from frictid_hil.gap.forward import Effects, Replay, Replayed, pooled
-from frictid_hil.gap.posterior import Draw
+from frictid_hil.gap.forward import Replayed, pooled
+from frictid_hil.gap.posterior import Draw, joined
 from frictid_hil.gap.residuals import rms
 
 COLOUR = 2.0
@@ -42,7 +41,7 @@ def closed(channel: Sampled, names: Collection[str]) -> Closed:
     """The gap of one channel without the named causes, and with them and what tolerances allow."""
     posterior = channel.posterior
     judged = posterior.channel.judged
-    constant = posterior.channel.name != "plant"
+    constant = posterior.channel.level_free
     every = [coefficients(channel, draw) for draw in _without_generic(channel, names)]
     mean = np.mean(every, axis=0)
     spread = [rms(_left(judged, theta, constant)) for theta in every]
@@ -69,11 +68,10 @@ def _without_generic(channel: Sampled, names: Collection[str]) -> list[Draw]:
 
 def coefficients(channel: Sampled, draw: Draw) -> Array:
     """Of all columns of the channel's table in one draw, those of functions without a name 0."""
-    theta = np.zeros(channel.posterior.channel.logs[0].x.shape[1])
-    for effect, (columns, values) in channel.posterior.contributions(draw).items():
-        if not effect.startswith(FAMILY):
-            np.add.at(theta, columns, values)
-    return theta
+    posterior = channel.posterior
+    told = [part for effect, part in posterior.contributions(draw).items() if not effect.startswith(FAMILY)]
+    columns, values = joined(told) if told else (np.zeros(0, dtype=int), np.zeros(0))
+    return np.bincount(columns, values, posterior.channel.logs[0].x.shape[1]).astype(np.float64)
 
 
 def _left(logs: Sequence[Rows], theta: Array, without_mean: bool) -> Array:
@@ -85,7 +83,7 @@ def _appeared(channel: Sampled, theta: Array) -> tuple[str, float] | None:
     """The validation log, and the time in it, from which on the causes explain much less than elsewhere."""
     posterior = channel.posterior
     fitted = [log for log in posterior.channel.logs if not log.validation]
-    if not fitted or channel.posterior.channel.name != "plant":
+    if not fitted or posterior.channel.level_free:
         return None
     usual = max(posterior.floor, rms(_left(fitted, theta, False)))
     for log in posterior.channel.logs:
@@ -106,32 +104,13 @@ def held_out(channel: Sampled) -> dict[str, float]:
     judged = posterior.channel.judged
 
     def squares(theta: Array) -> float:
-        return float(np.sum(_left(judged, theta, posterior.channel.name != "plant") ** 2))
+        return float(np.sum(_left(judged, theta, posterior.channel.level_free) ** 2))
 
     bare = squares(posterior.fitted(()))
     alone = {name: squares(posterior.fitted((term,))) for name, term in posterior.singles().items()}
     return {name: round(100.0 * (left / bare - 1.0), 2) for name, left in alone.items() if bare > 0.0}
 
 
-@dataclass(frozen=True, slots=True)
-class Simulated:
-    """Closed loop on the validation logs, without and with the named causes."""
-
-    before: Mapping[str, Replayed]
-    after: Mapping[str, Replayed]
-
-    def figures(self, when: str, log: str | None = None) -> tuple[float, float]:
-        """(torque in N m, position in rad): RMS of the difference, of one log or of all."""
-        chosen = getattr(self, when) if log is None else {log: getattr(self, when)[log]}
-        return pooled(chosen, "torque_nm"), pooled(chosen, "position_rad")
-
-    def per_log(self) -> dict[str, dict[str, Figures]]:
-        """Figures before and after by log."""
-        return {
-            log: {when: Figures(None, *self.figures(when, log)) for when in ("before", "after")} for log in self.before
-        }
-
-
-def simulated(replay: Replay, before: Mapping[str, Replayed], effects: Effects, validation: bool | None) -> Simulated:
-    """Both replays on the same logs."""
-    return Simulated(before, replay(effects, validation=validation) if effects else before)
+def simulated(differences: Mapping[str, Replayed]) -> tuple[float, float]:
+    """(torque in N m, position in rad): RMS of the difference in closed loop over all rows of the given logs."""
+    return pooled(differences, "torque_nm"), pooled(differences, "position_rad")

@@ -8,7 +8,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, Term
-from frictid_hil.gap.posterior import FORM, Draw, Posterior
+from frictid_hil.gap.posterior import FORM, Draw, Posterior, by_term
 from frictid_hil.simulation.effects import all_effects
 
 SPEED = FAMILY + "velocity"  # functions of speed without a name
@@ -25,7 +25,7 @@ def plainest(posterior: Posterior, draw: Draw, gram: Array) -> Draw:
     is the cause, and what it leaves has no name. ``gram`` holds mean products of the channel's columns, shape (m, m).
     """
     terms, known = posterior.terms(draw.model), len(posterior.channel.nuisances)
-    parts = np.split(draw.values, np.cumsum([len(term.columns) for term in terms])[:-1])
+    parts = [values for _, values in by_term(terms, draw.values)]
     of_speed = [k for k, term in enumerate(terms) if _of_speed(term)]
     plain = [k for k in of_speed if k < known]
     causes: dict[str, Array] = {}

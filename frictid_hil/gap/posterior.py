@@ -432,9 +432,8 @@ class Posterior:
         """Mean coefficients of a set, at its likeliest point of the grid, for all columns of the channel's table."""
         model = self.model(terms)
         at, mean, _ = self._coefficients(model, int(np.argmax(model.by_setting)))
-        theta = np.zeros(self.channel.logs[0].x.shape[1])
-        np.add.at(theta, self._columns[at], self._scale[at] * mean)
-        return theta
+        width = self.channel.logs[0].x.shape[1]
+        return np.bincount(self._columns[at], self._scale[at] * mean, width).astype(np.float64)
 
     def rival(self, cause: str, other: str) -> Known | None:
         """What the likeliest model knows that holds one cause and not the other; None where the channel has no such."""
@@ -463,16 +462,12 @@ class Posterior:
 
     def contributions(self, draw: Draw) -> dict[str, tuple[np.ndarray, Array]]:
         """By cause: (columns of the channel's table, coefficients), nuisances and terms together."""
-        result: dict[str, tuple[list[int], list[float]]] = {}
-        at = 0
+        parts: dict[str, list[tuple[np.ndarray, Array]]] = {}
         if draw.unnamed is not None:
-            result[UNNAMED] = list(range(draw.unnamed.size)), list(draw.unnamed)
-        for term in self.terms(draw.model):
-            columns, values = result.setdefault(term.effect, ([], []))
-            columns += term.columns
-            values += list(draw.values[at : at + len(term.columns)])
-            at += len(term.columns)
-        return {name: (np.array(c, dtype=int), np.array(v)) for name, (c, v) in result.items()}
+            parts[UNNAMED] = [(np.arange(draw.unnamed.size), draw.unnamed)]
+        for term, values in by_term(self.terms(draw.model), draw.values):
+            parts.setdefault(term.effect, []).append((np.array(term.columns, dtype=int), values))
+        return {name: joined(own) for name, own in parts.items()}
 
     def believed(self, draw: Draw, squares: Array) -> dict[str, float]:
         """By cause: mean square of what it makes of the residual before anything is recorded.
@@ -480,10 +475,9 @@ class Posterior:
         ``squares`` holds the mean square of every column of the channel's table.
         """
         care = self.settings[draw.setting].care
-        terms = [(term, care) for term in self.channel.nuisances]
-        terms += [(self.channel.candidates[t], 1.0) for t in draw.model.terms]
         result: dict[str, float] = {}
-        for term, widened in terms:
+        for k, term in enumerate(self.terms(draw.model)):
+            widened = care if k < len(self.channel.nuisances) else 1.0
             expected = term.mean**2 + (widened * term.deviation) ** 2
             made = float(expected @ squares[np.array(term.columns, dtype=int)])
             result[term.effect] = result.get(term.effect, 0.0) + made
@@ -501,6 +495,17 @@ class Draw:
     setting: int
     values: Array
     unnamed: Array | None = None
+
+
+def by_term(terms: Sequence[Term], values: Array) -> list[tuple[Term, Array]]:
+    """Terms, each with its own coefficients of a draw."""
+    ends = np.cumsum([len(term.columns) for term in terms])
+    return list(zip(terms, np.split(values, ends[:-1]), strict=True)) if terms else []
+
+
+def joined(parts: Sequence[tuple[np.ndarray, Array]]) -> tuple[np.ndarray, Array]:
+    """(columns, coefficients) of several parts one after the other."""
+    return np.concatenate([c for c, _ in parts]), np.concatenate([v for _, v in parts])
 
 
 def _put_inside(values: Array, root: Array, starts: np.ndarray, low: Array, high: Array) -> Array:

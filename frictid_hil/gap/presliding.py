@@ -11,7 +11,7 @@ further before it slips; elsewhere the travel is what stays. The recordings tell
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -35,54 +35,46 @@ ROUNDS = 3  # times that level and travel are fitted to one another
 CLEARLY = 0.95  # squares that remain with another travel, over those with the believed one, at most
 
 
-@dataclass(frozen=True, slots=True)
-class _Fit:
-    """What one form leaves, and the level that it finds."""
-
-    left: float  # squares of the torque that remain
-    level_nm: float  # of friction where the joint begins to slide
-
-
 def as_it_yields(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]:
     """(the set with the form of presliding that fits its recordings better, what to tell of it).
 
     A stiffness that is not stated has no form, and a form that is stated stays.
     """
     nominal = experiments.nominal
-    stated = nominal.yields_gradually is not None
-    if stated or nominal.presliding_stiffness_nm_per_rad is None or nominal.curve is None:
+    if nominal.yields_gradually is not None or nominal.presliding_stiffness_nm_per_rad is None or nominal.curve is None:
         return experiments, None
     logs = [r for r in recordings(experiments) if r.view is not None]
     if not logs:
         return experiments, None
-    told = None
-    at_once, gradual = _fit(logs, nominal), _fit(logs, replace(nominal, yields_gradually=True))
-    if gradual.left < at_once.left:
-        nominal, told = replace(nominal, yields_gradually=True), GRADUALLY
-    else:
-        nominal, told = _with_own_travel(logs, nominal, at_once)
-    return replace(experiments, nominal=nominal), told
+    told: str | None = GRADUALLY
+    form = replace(nominal, yields_gradually=True)
+    at_once, level_nm = _fit(logs, nominal)
+    if _fit(logs, form)[0] >= at_once:
+        form, told = _with_own_travel(logs, nominal, at_once, level_nm)
+    return replace(experiments, nominal=form), told
 
 
-def _with_own_travel(logs: Sequence[Recording], nominal: Nominal, believed: _Fit) -> tuple[Nominal, str | None]:
+def _with_own_travel(
+    logs: Sequence[Recording], nominal: Nominal, believed: float, level_nm: float
+) -> tuple[Nominal, str | None]:
     """The belief whose spring bends as far as the level of these recordings asks for, where that fits better."""
     assert nominal.presliding_stiffness_nm_per_rad is not None and nominal.curve is not None
     stiffness, level = nominal.presliding_stiffness_nm_per_rad, nominal.curve.coulomb_nm
-    found, longer = believed, nominal
+    left, own, longer = believed, stiffness, nominal
     for _ in range(ROUNDS):
-        if not WRONG < abs(found.level_nm / level - 1.0) < 1.0 / WRONG:
+        if not WRONG < abs(level_nm / level - 1.0) < 1.0 / WRONG:
             return nominal, None
-        longer = replace(nominal, presliding_stiffness_nm_per_rad=stiffness * level / found.level_nm)
-        found = _fit(logs, longer)
-    if found.left > CLEARLY * believed.left or longer.presliding_stiffness_nm_per_rad is None:
+        own = stiffness * level / level_nm
+        longer = replace(nominal, presliding_stiffness_nm_per_rad=own)
+        left, level_nm = _fit(logs, longer)
+    if left > CLEARLY * believed:
         return nominal, None
-    travel = level / longer.presliding_stiffness_nm_per_rad
-    return longer, FURTHER.format(now=travel, was=level / stiffness)
+    return longer, FURTHER.format(now=level / own, was=level / stiffness)
 
 
-def _fit(logs: Sequence[Recording], form: Nominal) -> _Fit:
-    """One form, numbers of the belief and a Stribeck effect fitted along."""
-    x, y = [], []
+def _fit(logs: Sequence[Recording], form: Nominal) -> tuple[float, float]:
+    """(squares of the torque that one form leaves, friction where sliding begins), belief and Stribeck fitted along."""
+    tables = []
     for log in logs:
         v, low_pass = log.view, LowPass.at(1.0 / log.step_s)
         assert v is not None and log.plant_nm is not None
@@ -92,12 +84,11 @@ def _fit(logs: Sequence[Recording], form: Nominal) -> _Fit:
         columns: list[Array] = [state, *falling, v.velocity_rad_s, v.acceleration_rad_s2, np.ones_like(state)]
         columns += [np.cos(v.position_rad), np.sin(v.position_rad), np.gradient(v.torque_nm, v.step_s)]
         columns += [] if log.experiment.rigid_body_torque_nm is None else [log.experiment.rigid_body_torque_nm]
-        table = low_pass.thinned(np.stack([*columns, log.plant_nm - believed], axis=1))
-        x.append(table[:, :-1])
-        y.append(table[:, -1])
-    table, rest = np.concatenate(x), np.concatenate(y)
+        tables.append(low_pass.thinned(np.stack([*columns, log.plant_nm - believed], axis=1)))
+    whole = np.concatenate(tables)
+    table, rest = np.ascontiguousarray(whole[:, :-1]), whole[:, -1].copy()
     weights = np.linalg.lstsq(table, rest, rcond=None)[0]
     begins = np.exp(-BEGINS_RAD_S / np.array([np.inf, *SLOW_RAD_S]))
     assert form.curve is not None
     level = form.curve.coulomb_nm + float(begins @ weights[: begins.size])
-    return _Fit(float(np.sum((rest - table @ weights) ** 2)), level)
+    return float(np.sum((rest - table @ weights) ** 2)), level

@@ -12,6 +12,7 @@ import numpy as np
 from frictid_hil.gap.channel import FAMILY, Term
 from frictid_hil.gap.findings import EVEN, VISIBLE, Finding, Sampled
 from frictid_hil.gap.how_far import Closed, coefficients
+from frictid_hil.gap.posterior import Draw
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -128,17 +129,22 @@ def _right(error: Finding, belief: Term) -> bool:
 
 def _unreached(cause: Finding, channels: Sequence[Sampled]) -> bool:
     """Whether the validation logs never come to where a cause shows, so that they say nothing of it."""
-    for channel in (c for c in channels if c.posterior.channel.name == cause.where):
-        draw = next((d for d in channel.draws if cause.effect in d.model.effects), None)
-        judged = [log for log in channel.posterior.channel.logs if log.validation]
-        if draw is None or not judged:
-            return False
-        columns, values = channel.posterior.contributions(draw)[cause.effect]
-        parts = [log.x[:, columns] @ values for log in judged]
-        levels = float(channel.posterior.channel.name != "plant")
-        made = np.concatenate([part - levels * np.mean(part) for part in parts])
-        return rms(made) < VISIBLE * channel.posterior.floor
-    return False
+    channel, draw = _first_with(cause, channels)
+    judged = [] if channel is None else [log for log in channel.posterior.channel.logs if log.validation]
+    if channel is None or draw is None or not judged:
+        return False
+    columns, values = channel.posterior.contributions(draw)[cause.effect]
+    parts = [log.x[:, columns] @ values for log in judged]
+    return (
+        rms(_levelled(parts) if channel.posterior.channel.level_free else np.concatenate(parts))
+        < VISIBLE * channel.posterior.floor
+    )
+
+
+def _first_with(cause: Finding, channels: Sequence[Sampled]) -> tuple[Sampled | None, Draw | None]:
+    """(The channel in which a cause shows most, its first draw that holds the cause)."""
+    channel = next((c for c in channels if c.posterior.channel.name == cause.where), None)
+    return channel, next((d for d in channel.draws if cause.effect in d.model.effects), None) if channel else None
 
 
 def _varies(cause: Finding, channels: Sequence[Sampled]) -> bool:
@@ -147,26 +153,19 @@ def _varies(cause: Finding, channels: Sequence[Sampled]) -> bool:
     That channel is replayed exactly, so that what stays has the size of noise. If instead its square grows with the
     square of what the cause makes, by a share v, then the cause's strength has a spread of sqrt(v) of itself.
     """
-    for channel in (c for c in channels if c.posterior.channel.name == "actuation" == cause.where):
-        draw = next((d for d in channel.draws if cause.effect in d.model.effects), None)
-        if draw is None:
-            continue
-        columns, values = channel.posterior.contributions(draw)[cause.effect]
-        theta = coefficients(channel, draw)
-        made, rest = [], []
-        for log in channel.posterior.channel.logs:
-            made.append(_level(log.x[:, columns] @ values, log.told))
-            rest.append(_level(log.y - log.x @ theta, log.told))
-        squares = np.concatenate(made) ** 2
-        about = squares - np.mean(squares)
-        return float(about @ np.concatenate(rest) ** 2) > HALF**2 * float(about @ about)
-    return False
+    channel, draw = _first_with(cause, channels)
+    if cause.where != "actuation" or channel is None or draw is None:
+        return False
+    columns, values = channel.posterior.contributions(draw)[cause.effect]
+    theta, logs = coefficients(channel, draw), channel.posterior.channel.logs
+    made = _levelled([(log.x[:, columns] @ values)[log.told] for log in logs])
+    about = made**2 - np.mean(made**2)
+    rest = _levelled([(log.y - log.x @ theta)[log.told] for log in logs])
+    return float(about @ rest**2) > HALF**2 * float(about @ about)
 
 
-def _level(values: np.ndarray, told: np.ndarray) -> np.ndarray:
-    """The rows that tell something, less their mean."""
-    rows: np.ndarray = values[told] - np.mean(values[told])
-    return rows
+def _levelled(parts: Sequence[np.ndarray]) -> np.ndarray:
+    return np.concatenate([part - np.mean(part) for part in parts])
 
 
 def _unnamed(loud: Sequence[Sampled]) -> bool:
@@ -193,8 +192,7 @@ def _open(gap: Closed, negligible: float) -> bool:
 
 
 def _root_sum(sizes: Sequence[np.ndarray]) -> np.ndarray:
-    total: np.ndarray = np.sqrt(np.sum([size**2 for size in sizes], axis=0))
-    return total
+    return np.asarray(np.sqrt(np.sum([size**2 for size in sizes], axis=0)))
 
 
 def _place(channels: Sequence[Sampled]) -> str:
