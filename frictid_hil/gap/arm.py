@@ -9,6 +9,7 @@ joint's own causes may be. One posterior weighs the causes of the arm against ea
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -37,6 +38,7 @@ LIGHTEST = 0.005  # mass of a payload, over that of all links, from which its ce
 SURE = 0.9  # chance from which a cause of the arm is named
 LEAST_GAIN = 0.02  # fall of the pooled RMS on logs that were not fitted, below which a cause has no practical meaning
 _ROTOR_KG_M2 = 100.0
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # no turn, as a quaternion
 NEGLIGIBLE = 1e-6  # share of the largest pivot below which a combination of parameters is not seen at all
 
 
@@ -144,33 +146,32 @@ class _Bodies:
         m.body_mass[body], m.body_ipos[body], m.body_inertia[body], m.body_iquat[body] = mass, centre, inertia, quat
         return inverse_torque(m, self._posture, self._numbers, *t) - _ROTOR_KG_M2 * t[2]
 
-    def scaled(self, body: int, t: Motion) -> Array:
+    def scaled(self, body: int, t: Motion) -> list[Array]:
         """Torque of a body as the file has it: what a share of its mass and inertia adds."""
         m = self._model
-        return self.of(body, t, m.body_mass[body], m.body_ipos[body], m.body_inertia[body], m.body_iquat[body])
+        return [self.of(body, t, m.body_mass[body], m.body_ipos[body], m.body_inertia[body], m.body_iquat[body])]
 
     def payload(self, t: Motion) -> list[Array]:
         """Mass at the grasp, and three first moments about it, per kg and kg m."""
-        unit, none = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
-        columns = [self.of(self.last, t, 1.0, self.grasp, none, unit)]
+        return self._point(self.last, t, self.grasp)
+
+    def _point(self, body: int, t: Motion, at: Array) -> list[Array]:
+        """The same of a body, at a place in its frame."""
+        columns = [self.of(body, t, 1.0, at, np.zeros(3), UPRIGHT)]
         for axis in np.eye(3):
             # Half the difference of opposite places: what is quadratic in the place falls out.
-            there = self.of(self.last, t, 1.0, self.grasp + 0.1 * axis, none, unit)
-            opposite = self.of(self.last, t, 1.0, self.grasp - 0.1 * axis, none, unit)
+            there, opposite = (self.of(body, t, 1.0, at + far * axis, np.zeros(3), UPRIGHT) for far in (0.1, -0.1))
             columns.append((there - opposite) / 0.2)
         return columns
 
     def tilt(self, t: Motion) -> list[Array]:
         """Gravity turned about the two axes across it, per rad."""
         still = (t[0], np.zeros_like(t[0]), np.zeros_like(t[0]))
-        gravity = self._model.opt.gravity.copy()
-        size = float(np.linalg.norm(gravity)) or 1.0
-        across = linalg.null_space(gravity[None, :] / size).T
         columns = []
-        for axis in across:
+        for axis in self.tilt_axes:
             m = copy.copy(self._model)
             m.jnt_stiffness[:] = 0.0
-            m.opt.gravity[:] = np.cross(axis, gravity)
+            m.opt.gravity[:] = np.cross(axis, self._model.opt.gravity)
             columns.append(inverse_torque(m, self._posture, self._numbers, *still))
         return columns
 
@@ -184,16 +185,13 @@ class _Bodies:
     def regressor(self, t: Motion) -> Array:
         """Mass, first moments and inertias of every body, (n * k, 10 * bodies)."""
         columns = []
-        unit, none = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+        none = np.zeros(3)
         # Half a right angle about each axis turns (1, -1, 0) into an off-diagonal inertia.
         c, s = math.cos(math.pi / 8.0), math.sin(math.pi / 8.0)
         turned = [([1.0, -1.0, 0.0], [c, 0, 0, s]), ([1.0, 0.0, -1.0], [c, 0, s, 0]), ([0.0, 1.0, -1.0], [c, s, 0, 0])]
         for body in self.bodies:
-            columns.append(self.of(body, t, 1.0, none, none, unit))
-            for axis in np.eye(3):
-                there = self.of(body, t, 1.0, 0.1 * axis, none, unit)
-                columns.append((there - self.of(body, t, 1.0, -0.1 * axis, none, unit)) / 0.2)
-            columns += [self.of(body, t, 0.0, none, axis, unit) for axis in np.eye(3)]
+            columns += self._point(body, t, none)
+            columns += [self.of(body, t, 0.0, none, axis, UPRIGHT) for axis in np.eye(3)]
             columns += [self.of(body, t, 0.0, none, np.array(i), np.array(q, dtype=float)) for i, q in turned]
         return np.stack([column.ravel() for column in columns], axis=1)
 
@@ -243,10 +241,12 @@ def _regression(
     bodies: _Bodies, fitted: Sequence[_Table], scale: Array, mass_tolerance: float
 ) -> tuple[Array, Array, Array, dict[str, Array]]:
     """(y, what tolerances allow, its one-sigma, columns of each cause of the arm); link masses come last in both."""
-    y, nuisance, prior, rows = _stacked(fitted, scale, _nuisances)
+    y, nuisance, prior, rows = _stacked(fitted, scale)
+    candidates = _candidates(bodies)
     masses = {
-        f"link_mass_error {bodies.name(body)}": _stacked_columns(fitted, scale, _one(bodies, body), rows)
-        for body in bodies.bodies
+        name: _stacked_columns(fitted, scale, make, rows)
+        for name, (make, _) in candidates.items()
+        if name.startswith("link_mass_error")
     }
     within = np.concatenate([nuisance, *masses.values()], axis=1)
     spread = np.concatenate([prior, np.full(len(masses), mass_tolerance)])
@@ -289,12 +289,9 @@ def _candidates(bodies: _Bodies) -> dict[str, tuple[Callable[..., list[Array]], 
         "base_orientation_error": (bodies.tilt, np.full(2, TILT_PRIOR_RAD)),
     }
     for body in bodies.bodies:
-        found[f"link_mass_error {bodies.name(body)}"] = (_one(bodies, body), np.array([MASS_PRIOR]))
+        scaled = functools.partial(bodies.scaled, body)
+        found[f"link_mass_error {bodies.name(body)}"] = (scaled, np.array([MASS_PRIOR]))
     return found
-
-
-def _one(bodies: _Bodies, body: int) -> Callable[..., list[Array]]:
-    return lambda t: [bodies.scaled(body, t)]
 
 
 def _table(bodies: _Bodies, curves: Sequence[FrictionCurve | None], r: Recorded) -> _Table:
@@ -340,32 +337,23 @@ def _nuisances(t: _Table, k: int, scale: float) -> tuple[Array, Array]:
     return np.stack(columns, axis=1), np.array(prior)
 
 
-def _stacked(
-    tables: Sequence[_Table], scale: Array, make: Callable[[_Table, int, float], tuple[Array, Array]]
-) -> tuple[Array, Array, Array, Rows]:
-    """(y, columns, priors, rows) of all joints one below the other, each counted in its own scale."""
+def _stacked(tables: Sequence[_Table], scale: Array) -> tuple[Array, Array, Array, Rows]:
+    """(y, columns, priors, rows) of all joints' own causes one below the other, each counted in its own scale."""
     joints = scale.size
     rows = [[np.flatnonzero(t.moving[:, k]) for k in range(joints)] for t in tables]
     y = np.concatenate([t.left[r[k], k] / scale[k] for k in range(joints) for t, r in zip(tables, rows, strict=True)])
     blocks, priors = [], []
     for k in range(joints):
-        parts = [make(t, k, scale[k]) for t in tables]
+        parts = [_nuisances(t, k, scale[k]) for t in tables]
         blocks.append(np.concatenate([p[0][r[k]] for p, r in zip(parts, rows, strict=True)]) / scale[k])
         priors.append(parts[0][1])
     return y, linalg.block_diag(*blocks), np.concatenate(priors), rows
 
 
 def _stacked_columns(tables: Sequence[_Table], scale: Array, make: Callable[..., list[Array]], rows: Rows) -> Array:
-    every = [make((t.position, t.velocity, t.acceleration)) for t in tables]
-    columns = []
-    for c in range(len(every[0])):
-        parts = [
-            columns_of[c][r[k], k] / scale[k]
-            for k in range(scale.size)
-            for columns_of, r in zip(every, rows, strict=True)
-        ]
-        columns.append(np.concatenate(parts))
-    return np.stack(columns, axis=1)
+    every = [np.stack(make((t.position, t.velocity, t.acceleration)), axis=-1) for t in tables]
+    parts = [m[r[k], k] / scale[k] for k in range(scale.size) for m, r in zip(every, rows, strict=True)]
+    return np.concatenate(parts)
 
 
 def _noise(y: Array, table: Array) -> float:
@@ -406,7 +394,7 @@ def _judged_rms(
     """Pooled RMS on the logs that were not fitted, joints' own causes and the candidate fitted on the others."""
 
     def stacked(tables: Sequence[_Table]) -> tuple[Array, Array]:
-        y, own, _, rows = _stacked(tables, scale, _nuisances)
+        y, own, _, rows = _stacked(tables, scale)
         more = [] if make is None else [_stacked_columns(tables, scale, make, rows)]
         return y, np.concatenate([own, *more], axis=1)
 

@@ -206,30 +206,27 @@ def catalogue(envelope: Envelope, *, seed: int = 0) -> dict[str, Experiment]:
     e = envelope
     small, large = e.centre_rad - e.travel_rad / 2, e.centre_rad - e.travel_rad
     shuffled = tuple(e.velocity_rad_s * n / 6 for n in (5, 2, 6, 3, 1, 4))
+    loaded = _sines(small, e.travel_rad, _rising(0.8 * e.velocity_rad_s, 5))
+    chirp = _chirp(e, e.chirp_velocity_rad_s, e.chirp_high_hz)
+    crept, crept_long = _breakaway(e, (0.6, 1.2, 2.4, 0.3, 1.2)), _breakaway(e, (0.2, 1.0, 4.0, 8.0, 0.5))
+    reported = "nothing: the gap is reported here"
     experiments = [
-        _sines("sines_small", small, e.travel_rad, _rising(e.velocity_rad_s, 8), "the friction curve"),
-        _sines("sines_large", large, 2 * e.travel_rad, _rising(e.velocity_rad_s, 6), "speed against position"),
-        _triangle("triangle_slow", e, "ripple, the shape of gravity, hysteresis at reversals"),
-        _sines(
-            "sines_payload",
-            small,
-            e.travel_rad,
-            _rising(0.8 * e.velocity_rad_s, 5),
-            "load, gravity, inertia, torque constant",
-            payload=True,
-        ),
-        _chirp("chirp", e, e.chirp_velocity_rad_s, e.chirp_high_hz, "delay, lag, elasticity, inertia"),
-        _breakaway("breakaway", e, (0.6, 1.2, 2.4, 0.3, 1.2), "stiction that grows with the dwell, presliding"),
-        _moves(e, seed),
-        _sines("sines_repeat", small, e.travel_rad, shuffled, "nothing: the gap is reported here", role="validation"),
-        _chirp("chirp_fast", e, 0.6 * e.chirp_velocity_rad_s, 2.5 * e.chirp_high_hz, "delay against lag"),
-        _chirp("chirp_payload", e, e.chirp_velocity_rad_s, e.chirp_high_hz, "inertia against payload", payload=True),
-        _breakaway("breakaway_long", e, (0.2, 1.0, 4.0, 8.0, 0.5), "stiction against a Stribeck curve"),
-        _triangles(e),
+        _of("sines_small", _sines(small, e.travel_rad, _rising(e.velocity_rad_s, 8)), "the friction curve"),
+        _of("sines_large", _sines(large, 2 * e.travel_rad, _rising(e.velocity_rad_s, 6)), "speed against position"),
+        _of("triangle_slow", _triangle(e), "ripple, the shape of gravity, hysteresis at reversals", dwell_s=1.0),
+        _of("sines_payload", loaded, "load, gravity, inertia, torque constant", payload=True),
+        _of("chirp", chirp, "delay, lag, elasticity, inertia"),
+        _of("breakaway", crept, "stiction that grows with the dwell, presliding", dwell_s=0.8),
+        _of("moves_payload", _moves(e, seed), reported, role="validation", payload=True),
+        _of("sines_repeat", _sines(small, e.travel_rad, shuffled), reported, role="validation"),
+        _of("chirp_fast", _chirp(e, 0.6 * e.chirp_velocity_rad_s, 2.5 * e.chirp_high_hz), "delay against lag"),
+        _of("chirp_payload", chirp, "inertia against payload", payload=True),
+        _of("breakaway_long", crept_long, "stiction against a Stribeck curve", dwell_s=0.8),
+        _of("triangle_speeds", _triangles(e), "friction between rest and sliding", dwell_s=1.0),
     ]
     if e.second_centre_rad is not None:
-        aside = replace(e, centre_rad=e.second_centre_rad)
-        experiments.append(_triangle("second_posture", aside, "bias against encoder offset and gravity"))
+        aside = _triangle(replace(e, centre_rad=e.second_centre_rad))
+        experiments.append(_of("second_posture", aside, "bias against encoder offset and gravity", dwell_s=1.0))
     return {experiment.name: experiment for experiment in experiments}
 
 
@@ -273,28 +270,17 @@ def _rising(velocity_rad_s: float, cycles: int) -> tuple[float, ...]:
     return tuple(velocity_rad_s * (n + 1) / cycles for n in range(cycles))
 
 
-def _sines(
-    name: str,
-    start_rad: float,
-    travel_rad: float,
-    speeds_rad_s: tuple[float, ...],
-    reveals: str,
-    *,
-    role: str = "identification",
-    payload: bool = False,
-) -> Experiment:
-    cycles = [Sine(start_rad, travel_rad, speed) for speed in speeds_rad_s]
-    return _experiment(name, role, payload, cycles, reveals)
+def _sines(start_rad: float, travel_rad: float, speeds_rad_s: tuple[float, ...]) -> list[Motion]:
+    return [Sine(start_rad, travel_rad, speed) for speed in speeds_rad_s]
 
 
-def _triangle(name: str, e: Envelope, reveals: str) -> Experiment:
+def _triangle(e: Envelope) -> list[Motion]:
     quarter_s = e.triangle_rad / e.triangle_velocity_rad_s
     c, a = e.centre_rad, e.triangle_rad
-    corners = Corners("triangle", (0.0, quarter_s, 3 * quarter_s, 4 * quarter_s), (c, c + a, c - a, c))
-    return _experiment(name, "identification", False, [corners], reveals, 1.0)
+    return [Corners("triangle", (0.0, quarter_s, 3 * quarter_s, 4 * quarter_s), (c, c + a, c - a, c))]
 
 
-def _triangles(e: Envelope) -> Experiment:
+def _triangles(e: Envelope) -> list[Motion]:
     """To and fro at constant speeds, each half the one before."""
     times, positions = [0.0], [e.centre_rad]
     for k in range(5):
@@ -303,18 +289,14 @@ def _triangles(e: Envelope) -> Experiment:
         for there in (e.centre_rad + reach, e.centre_rad):
             times.append(times[-1] + reach / speed)
             positions.append(there)
-    corners = Corners("triangles", tuple(times), tuple(positions))
-    return _experiment("triangle_speeds", "identification", False, [corners], "friction between rest and sliding", 1.0)
+    return [Corners("triangles", tuple(times), tuple(positions))]
 
 
-def _chirp(
-    name: str, e: Envelope, velocity_rad_s: float, high_hz: float, reveals: str, *, payload: bool = False
-) -> Experiment:
-    chirp = Chirp(e.centre_rad + 0.2 * e.triangle_rad, velocity_rad_s, high_hz, 10.0)
-    return _experiment(name, "identification", payload, [chirp], reveals)
+def _chirp(e: Envelope, velocity_rad_s: float, high_hz: float) -> list[Motion]:
+    return [Chirp(e.centre_rad + 0.2 * e.triangle_rad, velocity_rad_s, high_hz, 10.0)]
 
 
-def _breakaway(name: str, e: Envelope, dwells_s: tuple[float, ...], reveals: str) -> Experiment:
+def _breakaway(e: Envelope, dwells_s: tuple[float, ...]) -> list[Motion]:
     """Creep steps of 14 mrad with dwells between them, three one way and three back."""
     step_rad = 0.014
     step_s = step_rad / e.creep_velocity_rad_s
@@ -325,11 +307,10 @@ def _breakaway(name: str, e: Envelope, dwells_s: tuple[float, ...], reveals: str
         if dwell_s:
             times.append(times[-1] + dwell_s)
             positions.append(positions[-1])
-    corners = Corners("breakaway", tuple(times), tuple(positions))
-    return _experiment(name, "identification", False, [corners], reveals, 0.8)
+    return [Corners("breakaway", tuple(times), tuple(positions))]
 
 
-def _moves(e: Envelope, seed: int) -> Experiment:
+def _moves(e: Envelope, seed: int) -> list[Motion]:
     """Point-to-point moves of random length, speed and pause: ordinary work, unlike any identification motion."""
     rng = np.random.default_rng([seed, 6])
     here = e.centre_rad
@@ -344,15 +325,21 @@ def _moves(e: Envelope, seed: int) -> Experiment:
         pause_s = float(rng.choice([0.2, 0.2, 0.7]))
         moves += [Move.within(here, there, speed), Hold(there, pause_s)]
         here = there
-    return _experiment("moves_payload", "validation", True, moves, "nothing: the gap is reported here")
+    return moves
 
 
-def _experiment(
-    name: str, role: str, payload: bool, motions: list[Any], reveals: str, dwell_s: float = 0.6, tail_s: float = 0.4
+def _of(
+    name: str,
+    motions: list[Motion],
+    reveals: str,
+    *,
+    role: str = "identification",
+    payload: bool = False,
+    dwell_s: float = 0.6,
 ) -> Experiment:
-    first = float(motions[0].position_rad(np.zeros(1))[0])
-    last = float(motions[-1].position_rad(np.full(1, motions[-1].duration_s))[0])
-    return Experiment(name, role, payload, (Hold(first, dwell_s), *motions, Hold(last, tail_s)), reveals)
+    """An experiment of these motions between two rests."""
+    bare = Experiment(name, role, payload, tuple(motions), reveals)
+    return replace(bare, motions=(Hold(bare.start_rad, dwell_s), *motions, Hold(bare.end_rad, 0.4)))
 
 
 def _smooth(u: Array) -> Array:
