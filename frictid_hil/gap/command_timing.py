@@ -47,7 +47,7 @@ def in_force(experiments: ExperimentSet) -> ExperimentSet:
 def _between_rows(nominal: Nominal, e: Experiment) -> bool:
     """Whether a log whose demand is replayed lacks ticks of its controller."""
     known = e.torque_nm is not None and e.position_command_rad is not None and e.torque_demand_nm is None
-    return known and between_rows(nominal.controller, float(np.median(np.diff(e.time_s))))
+    return known and between_rows(nominal.controller, e.step_s)
 
 
 def _shifted(e: Experiment, late: float) -> Experiment:

@@ -38,17 +38,6 @@ LOG_COLUMNS = ("time_s", *Samples.COLUMNS[:4], "rigid_body_torque_nm", "temperat
 
 
 @dataclass(frozen=True, slots=True)
-class FeedForward:
-    """What a controller adds along its command: ``inertia*acc + gravity(cmd) + coulomb*sign(v) + viscous*v``."""
-
-    inertia_kg_m2: float = 0.0
-    gravity_cos_nm: float = 0.0
-    gravity_sin_nm: float = 0.0
-    coulomb_nm: float = 0.0
-    viscous_nm_s_per_rad: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
 class Controller:
     """The digital position loop, joint side.
 
@@ -66,7 +55,7 @@ class Controller:
     command_rate: str = "central"
     command_weight: float = 1.0  # b
     command_rate_weight: float = 1.0  # c
-    feedforward: FeedForward | None = None  # None where there is none
+    feedforward: config.FeedForward | None = None  # None where there is none
 
     def added_nm(self, command_rad: Array, step_s: float) -> Array:
         """What the law adds to a plain PID because of its command's weight and its feed-forward, shape (n,)."""
@@ -131,6 +120,11 @@ class Experiment:
     rigid_body_torque_nm: Array | None = None  # the part that the user's own rigid-body model explains
     temperature_c: Array | None = None  # of motor or gear
     torque_demand_nm: Array | None = None  # the controller's own demand, where the log brings it
+
+    @property
+    def step_s(self) -> float:
+        """Median sampling step."""
+        return float(np.median(np.diff(self.time_s)))
 
     @property
     def travel_rad(self) -> float:
@@ -266,7 +260,6 @@ def _controller(told: config.ControllerFile) -> Controller | None:
     if told.type in ("columns", "unknown") or told.rate_hz is None or told.kp is None:
         return None
     ki = told.ki or 0.0
-    feed = told.feedforward
     plain = Controller(
         rate_hz=told.rate_hz,
         kp_nm_per_rad=told.kp,
@@ -275,7 +268,7 @@ def _controller(told: config.ControllerFile) -> Controller | None:
         velocity_filter_s=told.velocity_filter_s or 0.0,
         torque_limit_nm=told.torque_limit_nm or float("inf"),
         command_rate=told.command_rate or "central",
-        feedforward=None if feed is None else FeedForward(**feed.model_dump()),
+        feedforward=told.feedforward,
     )
     if told.type == "pid" or told.kv is None:
         return plain

@@ -146,7 +146,7 @@ class Replay:
     def _rows(self, model: JointModel, e: Experiment, state: CarryOver | None) -> Simulated:
         """One recording simulated, its torque reported as the drive does: the controller's last tick, filtered."""
         assert e.position_command_rad is not None
-        step_s = float(np.median(np.diff(e.time_s)))
+        step_s = e.step_s
         ticks = max(1, round(self._controller.rate_hz * step_s))
         last = (e.time_s.size - 1) * ticks + 1
         time, command = between(e.time_s, ticks)[:last], between(e.position_command_rad, ticks)[:last]
@@ -164,7 +164,7 @@ class Replay:
 
     def _one(self, model: JointModel, experiment: Experiment, state: CarryOver | None) -> tuple[Replayed, CarryOver]:
         rows = self._rows(model, experiment, state)
-        low_pass = LowPass.at(1.0 / float(np.median(np.diff(experiment.time_s))))
+        low_pass = LowPass.at(1.0 / experiment.step_s)
         measured = experiment.torque_nm
         torque = np.zeros_like(rows.torque_nm) if measured is None else measured - rows.torque_nm
         held = first_slide(experiment.position_rad, self._slide_rad) + round(SETTLING_S * low_pass.rate_hz)

@@ -47,18 +47,17 @@ def checked(experiments: ExperimentSet) -> ExperimentSet:
 
 
 def _check(e: Experiment, nominal: Nominal) -> None:
-    where = e.name
     if e.time_s.size < LEAST_ROWS:
-        raise InputFileError(f"{e.time_s.size} rows; a diagnosis needs at least {LEAST_ROWS}", where=where)
+        raise InputFileError(f"{e.time_s.size} rows; a diagnosis needs at least {LEAST_ROWS}", where=e.name)
     for name in LOG_COLUMNS[:6]:  # a temperature or a demand may stand still
         column = getattr(e, name)
         if column is None:
             continue
         if not np.all(np.isfinite(column)):
             row = int(np.flatnonzero(~np.isfinite(column))[0])
-            raise InputFileError(f"column {name} is not finite, first in row {row}", where=where)
+            raise InputFileError(f"column {name} is not finite, first in row {row}", where=e.name)
         if float(np.ptp(column)) == 0.0 and name != "rigid_body_torque_nm":
-            raise InputFileError(f"column {name} never changes", where=where, cause="a sensor or a mapping is dead")
+            raise InputFileError(f"column {name} never changes", where=e.name, cause="a sensor or a mapping is dead")
     _check_time(e)
     _check_position(e, nominal)
     if e.velocity_rad_s is not None:
@@ -72,10 +71,9 @@ def _check_time(e: Experiment) -> None:
     if np.any(steps <= 0.0):
         row = int(np.flatnonzero(steps <= 0.0)[0]) + 1
         raise InputFileError(f"time does not increase at row {row}", where=e.name)
-    step_s = float(np.median(steps))
-    if step_s > SLOWEST_STEP_S:
+    if e.step_s > SLOWEST_STEP_S:
         raise InputFileError(
-            f"samples are {step_s:.3g} s apart; friction needs at least {1 / SLOWEST_STEP_S:g} a second",
+            f"samples are {e.step_s:.3g} s apart; friction needs at least {1 / SLOWEST_STEP_S:g} a second",
             where=e.name,
             cause="the time is probably in milliseconds",
             next_step="state its unit in a column map, or convert it to s",
@@ -85,8 +83,7 @@ def _check_time(e: Experiment) -> None:
 def _check_position(e: Experiment, nominal: Nominal) -> None:
     if nominal.continuous:
         return
-    step_s = float(np.median(np.diff(e.time_s)))
-    speed = np.abs(np.gradient(LowPass.at(1.0 / step_s)(e.position_rad), e.time_s))
+    speed = np.abs(np.gradient(LowPass.at(1.0 / e.step_s)(e.position_rad), e.time_s))
     farthest, fastest = float(np.max(np.abs(e.position_rad))), float(np.quantile(speed, 0.99))
     if nominal.curve is not None and fastest < LARGEST_SPEED_SHARE * max(nominal.curve.velocity_rad_s):
         return
@@ -101,17 +98,15 @@ def _check_position(e: Experiment, nominal: Nominal) -> None:
 
 def _check_velocity(e: Experiment, velocity_rad_s: Array) -> None:
     """The reported velocity must be the position's derivative but for a lag, noise and a few percent."""
-    step_s = float(np.median(np.diff(e.time_s)))
-    low_pass = LowPass.at(1.0 / step_s)
+    low_pass = LowPass.at(1.0 / e.step_s)
     true = np.gradient(low_pass(e.position_rad), e.time_s)
     slope = float(true @ low_pass(velocity_rad_s) / max(float(true @ true), 1e-300))
     if 0.4 < slope < 2.5:
         return
-    cause = "its sign is swapped" if slope < 0.0 else "it is probably in degrees per second or of the motor"
     raise InputFileError(
         f"column velocity_rad_s is {slope:.3g} times the derivative of position_rad; 1 is expected",
         where=e.name,
-        cause=cause,
+        cause="its sign is swapped" if slope < 0.0 else "it is probably in degrees per second or of the motor",
         next_step="correct the column, or leave it out: the position alone will do",
     )
 
@@ -200,7 +195,7 @@ def _torque_sign(e: Experiment) -> float | None:
     # Compared at equal places, gravity cancels; a fit of torque on direction and position does that.
     direction = np.sign(moved)
     q = e.position_rad[:-1]
-    acceleration = np.gradient(np.gradient(LowPass.at(1.0 / float(np.median(np.diff(e.time_s))))(q)))
+    acceleration = np.gradient(np.gradient(LowPass.at(1.0 / e.step_s)(q)))
     columns = np.stack(
         [direction, np.cos(q), np.sin(q), acceleration / max(float(np.std(acceleration)), 1e-12)], axis=1
     )
@@ -231,13 +226,8 @@ def completed(experiments: ExperimentSet) -> tuple[ExperimentSet, dict[str, str]
     fitted = fitted or [e for e in experiments.experiments if e.torque_nm is not None]
     if not fitted:
         return experiments, {}
-    blocks, targets = [], []
-    for e in fitted:
-        x, y = _rigid_columns(uniform(e)[0], nominal, given)
-        blocks.append(x)
-        targets.append(y)
-    columns, target = np.concatenate(blocks), np.concatenate(targets)
-    weights = np.linalg.lstsq(columns, target, rcond=None)[0]
+    table = np.concatenate([_rigid_columns(uniform(e)[0], nominal, given) for e in fitted])
+    weights = np.linalg.lstsq(table[:, :-1], table[:, -1], rcond=None)[0]
     level, viscous = max(1e-6, float(weights[3])), float(weights[4])
     reasons = {}
     changes: dict[str, object] = {}
@@ -255,10 +245,10 @@ def completed(experiments: ExperimentSet) -> tuple[ExperimentSet, dict[str, str]
     return replace(experiments, nominal=replace(nominal, **changes)), reasons  # type: ignore[arg-type]
 
 
-def _rigid_columns(e: Experiment, nominal: Nominal, given: bool) -> tuple[Array, Array]:
-    step_s = float(np.median(np.diff(e.time_s)))
+def _rigid_columns(e: Experiment, nominal: Nominal, given: bool) -> Array:
+    """Columns of inertia, gravity and friction, and the torque last, behind the low-pass, shape (rows, 6)."""
+    step_s, q = e.step_s, e.position_rad
     low_pass = LowPass.at(1.0 / step_s)
-    q = e.position_rad
     velocity = np.gradient(q, step_s)
     acceleration = np.zeros_like(q)
     acceleration[1:-1] = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / step_s**2
@@ -272,8 +262,8 @@ def _rigid_columns(e: Experiment, nominal: Nominal, given: bool) -> tuple[Array,
         known = nominal.inertia_kg_m2 * acceleration + nominal.gravity_cos_nm * np.cos(q)
         torque = torque - known - nominal.gravity_sin_nm * np.sin(q)
         columns[:, :3] = 0.0
-    table = low_pass(np.concatenate([columns, torque[:, None]], axis=1))[:: low_pass.stride]
-    return table[:, :-1], table[:, -1]
+    table: Array = low_pass(np.concatenate([columns, torque[:, None]], axis=1))[:: low_pass.stride]
+    return table
 
 
 def one_sided(experiments: ExperimentSet) -> str | None:
@@ -281,10 +271,9 @@ def one_sided(experiments: ExperimentSet) -> str | None:
     forth = back = 0.0
     speeds = []
     for e in experiments.experiments:
-        step_s = float(np.median(np.diff(e.time_s)))
-        velocity = LowPass.at(1.0 / step_s)(np.gradient(e.position_rad, step_s))
-        forth += float(np.sum(np.maximum(velocity, 0.0)) * step_s)
-        back += float(np.sum(np.maximum(-velocity, 0.0)) * step_s)
+        velocity = LowPass.at(1.0 / e.step_s)(np.gradient(e.position_rad, e.step_s))
+        forth += float(np.sum(np.maximum(velocity, 0.0)) * e.step_s)
+        back += float(np.sum(np.maximum(-velocity, 0.0)) * e.step_s)
         speeds.append(np.abs(velocity))
     total = forth + back
     if total <= 0.0:
