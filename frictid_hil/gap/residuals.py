@@ -423,26 +423,12 @@ def demand_of(
     if experiment.torque_demand_nm is not None:
         return experiment.torque_demand_nm
     assert experiment.position_command_rad is not None
-    q, command = experiment.position_rad, experiment.position_command_rad
+    q, command, seen = experiment.position_rad, experiment.position_command_rad, velocity_rad_s
+    replayed = functools.partial(controller_demand, step_s=step_s, velocity_lag_s=velocity_lag_s)
     level = 0.0
     if experiment.torque_nm is not None:
         rows = _start_rows(q, step_s)
-        free = controller_demand(
-            replace(controller, torque_limit_nm=math.inf),
-            q[:rows],
-            command[:rows],
-            step_s,
-            velocity_rad_s=None if velocity_rad_s is None else velocity_rad_s[:rows],
-            velocity_lag_s=velocity_lag_s,
-        )
-        level = float(np.median(experiment.torque_nm[1:rows] - held(free)[1:]))
-    return controller_demand(
-        controller,
-        q,
-        command,
-        step_s,
-        integral_nm=level,
-        velocity_rad_s=velocity_rad_s,
-        velocity_lag_s=velocity_lag_s,
-        every_tick=every_tick,
-    )
+        free, begins = replace(controller, torque_limit_nm=math.inf), None if seen is None else seen[:rows]
+        demand = replayed(free, q[:rows], command[:rows], velocity_rad_s=begins)
+        level = float(np.median(experiment.torque_nm[1:rows] - held(demand)[1:]))
+    return replayed(controller, q, command, integral_nm=level, velocity_rad_s=seen, every_tick=every_tick)
