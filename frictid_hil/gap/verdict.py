@@ -129,22 +129,19 @@ def _right(error: Finding, belief: Term) -> bool:
 
 def _unreached(cause: Finding, channels: Sequence[Sampled]) -> bool:
     """Whether the validation logs never come to where a cause shows, so that they say nothing of it."""
-    channel, draw = _first_with(cause, channels)
-    judged = [] if channel is None else [log for log in channel.posterior.channel.logs if log.validation]
-    if channel is None or draw is None or not judged:
+    if (found := _first_with(cause, channels)) is None:
         return False
-    columns, values = channel.posterior.contributions(draw)[cause.effect]
-    parts = [log.x[:, columns] @ values for log in judged]
-    return (
-        rms(_levelled(parts) if channel.posterior.channel.level_free else np.concatenate(parts))
-        < VISIBLE * channel.posterior.floor
-    )
+    posterior = found[0].posterior
+    columns, values = posterior.contributions(found[1])[cause.effect]
+    parts = [log.x[:, columns] @ values for log in posterior.channel.logs if log.validation]
+    joined = _levelled if posterior.channel.level_free else np.concatenate
+    return bool(parts) and rms(joined(parts)) < VISIBLE * posterior.floor
 
 
-def _first_with(cause: Finding, channels: Sequence[Sampled]) -> tuple[Sampled | None, Draw | None]:
-    """(The channel in which a cause shows most, its first draw that holds the cause)."""
-    channel = next((c for c in channels if c.posterior.channel.name == cause.where), None)
-    return channel, next((d for d in channel.draws if cause.effect in d.model.effects), None) if channel else None
+def _first_with(cause: Finding, channels: Sequence[Sampled]) -> tuple[Sampled, Draw] | None:
+    """The channel in which a cause shows most, with its first draw that holds the cause."""
+    home = [c for c in channels if c.posterior.channel.name == cause.where]
+    return next(((c, d) for c in home for d in c.draws if cause.effect in d.model.effects), None)
 
 
 def _varies(cause: Finding, channels: Sequence[Sampled]) -> bool:
@@ -153,9 +150,9 @@ def _varies(cause: Finding, channels: Sequence[Sampled]) -> bool:
     That channel is replayed exactly, so that what stays has the size of noise. If instead its square grows with the
     square of what the cause makes, by a share v, then the cause's strength has a spread of sqrt(v) of itself.
     """
-    channel, draw = _first_with(cause, channels)
-    if cause.where != "actuation" or channel is None or draw is None:
+    if cause.where != "actuation" or (found := _first_with(cause, channels)) is None:
         return False
+    channel, draw = found
     columns, values = channel.posterior.contributions(draw)[cause.effect]
     theta, logs = coefficients(channel, draw), channel.posterior.channel.logs
     made = _levelled([(log.x[:, columns] @ values)[log.told] for log in logs])

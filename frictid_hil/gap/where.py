@@ -163,28 +163,24 @@ def _sliding(logs: Sequence[_Log], top: float, noise_nm: float) -> dict[tuple[Re
     if y.size < 4 * sum(c.shape[1] for c in columns.values()):
         return {}
     explained = _Explained(columns, y)
-    result: dict[tuple[Region, str], float] = {}
-    for name, squares in explained.shares().items():
-        if name is not Region.VELOCITY_BAND:
-            result[name, _WORDS[name]] = squares
+    shares = explained.shares()
     # What depends on speed is told by band, each by its own squares.
-    by_speed = explained.shares()[Region.VELOCITY_BAND]
+    by_speed = shares.pop(Region.VELOCITY_BAND)
+    result = {(name, _WORDS[name]): squares for name, squares in shares.items()}
     fitted = explained.fitted((Region.VELOCITY_BAND,)) ** 2
     rest = y - explained.fitted(tuple(names))
-    fast, slow, start = 0.0, np.empty(y.size), 0
-    for log, w in zip(logs, weight, strict=True):
-        count = int(np.count_nonzero(log.sliding))
+    fast, parts = 0.0, []
+    ends = np.cumsum([np.count_nonzero(log.sliding) for log in logs])
+    for log, w, own in zip(logs, weight, np.split(rest, ends[:-1]), strict=True):
         part = np.zeros(log.residual_nm.size)
-        part[log.sliding] = rest[start : start + count]
+        part[log.sliding] = own
         above = _above(part, 1.0 / (log.recording.step_s * log.stride))
-        white = (noise_nm * w) ** 2 * count
+        white = (noise_nm * w) ** 2
         share = float(np.sum(above**2)) / max(float(np.sum(part**2)), 1e-300)
-        fast += max(0.0, float(np.sum(above**2)) - share * white)
+        fast += max(0.0, float(np.sum(above**2)) - share * (white * own.size))
         # Halves of a spectrum are orthogonal; sample by sample the slow one keeps its part of the squares.
-        slow[start : start + count] = (1.0 - share) * np.maximum(
-            rest[start : start + count] ** 2 - (noise_nm * w) ** 2, 0.0
-        )
-        start += count
+        parts.append((1.0 - share) * np.maximum(own**2 - white, 0.0))
+    slow = np.concatenate(parts)
     result[Region.FREQUENCY, _WORDS[Region.FREQUENCY]] = fast
     speed = np.concatenate([np.abs(log.velocity_rad_s[log.sliding]) for log in logs])
     whole = max(float(np.sum(fitted)), 1e-300)
@@ -216,11 +212,8 @@ def _families(log: _Log, top: float, end_s: float, warm_c: float) -> dict[Region
     }
     low_pass = LowPass.at(1.0 / log.recording.step_s)
     thin = low_pass.thinned(np.stack([c for family in raw.values() for c in family], axis=1))
-    result: dict[Region, Array] = {}
-    at = 0
-    for region, family in raw.items():
-        result[region] = thin[:, at : at + len(family)]
-        at += len(family)
+    ends = np.cumsum([len(family) for family in raw.values()])
+    result = dict(zip(raw, np.split(thin, ends[:-1], axis=1), strict=True))
     edges = np.array([*SPEED_BANDS, np.inf]) * top
     band = np.clip(np.digitize(np.abs(v), edges) - 1, 0, len(SPEED_BANDS) - 1) + len(SPEED_BANDS) * (v < 0)
     result[Region.VELOCITY_BAND] = np.eye(2 * len(SPEED_BANDS))[band]
