@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from frictid_hil.config.nominal import ReportFilter
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Builder, Channel, Term, of_each_log, rows_of
 from frictid_hil.gap.command_timing import FASTEST, between_rows
-from frictid_hil.gap.experiment_set import Controller, Nominal, ReportFilter
+from frictid_hil.gap.experiment_set import Controller, Nominal
 from frictid_hil.gap.plant_channel import BEYOND, families_of, white_nm, without_nuisances
 from frictid_hil.gap.residuals import (
     LowPass,

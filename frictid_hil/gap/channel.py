@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from frictid_hil.config.nominal import ReportFilter
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.experiment_set import ReportFilter
 from frictid_hil.gap.residuals import LowPass, Recording, reported
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import Shape

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.config import nominal as config
-from frictid_hil.config.nominal import NominalFile, load_nominal
+from frictid_hil.config.nominal import NominalFile, ReportFilter, load_nominal
 from frictid_hil.errors import ConfigError, InputFileError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
@@ -66,14 +66,6 @@ class Controller:
             added = added + feed.gravity_cos_nm * np.cos(command_rad) + feed.gravity_sin_nm * np.sin(command_rad)
             added = added + feed.coulomb_nm * np.sign(velocity) + feed.viscous_nm_s_per_rad * velocity
         return added
-
-
-@dataclass(frozen=True, slots=True)
-class ReportFilter:
-    """A low-pass that the reported torque has passed: ``order`` first-order lags of ``time_constant_s`` in a row."""
-
-    order: int
-    time_constant_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,12 +211,10 @@ def _without_long_gaps(log: Experiment, samples: Samples) -> list[Experiment]:
     ]
 
 
-_YIELDS = {"gradually": True, "at once": False, None: None}
-
-
 def _nominal(file: NominalFile, document: Mapping[str, Any], where: str) -> Nominal:
     """The belief of a checked file."""
-    joint, drive, encoder = file.joint, file.drive, file.encoder
+    joint, drive, encoder = file.joint, file.drive or config.Drive(), file.encoder or config.Encoder()
+    friction, report, payload = joint.friction or config.Friction(), drive.torque_report_filter, file.payload
     gravity_cos = joint.gravity_torque_nm if joint.gravity_torque_nm is not None else joint.gravity_cos_nm
     return Nominal(
         inertia_kg_m2=joint.inertia_kg_m2,
@@ -232,19 +222,17 @@ def _nominal(file: NominalFile, document: Mapping[str, Any], where: str) -> Nomi
         gravity_cos_nm=gravity_cos or 0.0,
         gravity_sin_nm=joint.gravity_sin_nm or 0.0,
         gear_ratio=joint.gear_ratio,
-        curve=_curve(joint.friction, where),
-        presliding_stiffness_nm_per_rad=joint.friction.presliding_stiffness_nm_per_rad if joint.friction else None,
-        yields_gradually=_YIELDS[joint.friction.presliding_yields] if joint.friction else None,
-        payload=None
-        if file.payload is None
-        else Payload(file.payload.inertia_kg_m2 or 0.0, file.payload.gravity_torque_nm or 0.0),
+        curve=_curve(friction, where),
+        presliding_stiffness_nm_per_rad=friction.presliding_stiffness_nm_per_rad,
+        yields_gradually=None if friction.presliding_yields is None else friction.presliding_yields == "gradually",
+        payload=None if payload is None else Payload(payload.inertia_kg_m2 or 0.0, payload.gravity_torque_nm or 0.0),
         controller=None if file.controller is None else _controller(file.controller),
-        rated_torque_nm=drive.rated_torque_nm if drive else None,
-        torque_quantum_nm=drive.torque_quantum_nm if drive else None,
-        torque_report_filter=_report_filter(drive),
+        rated_torque_nm=drive.rated_torque_nm,
+        torque_quantum_nm=drive.torque_quantum_nm,
+        torque_report_filter=report if report and report.time_constant_s > 0.0 else None,
         believed_effects=_believed_effects(document.get("drive") or {}),
-        encoder_resolution_rad=encoder.resolution_rad if encoder else None,
-        velocity_filter_s=(encoder.velocity_filter_s if encoder else None) or 0.0,
+        encoder_resolution_rad=encoder.resolution_rad,
+        velocity_filter_s=encoder.velocity_filter_s or 0.0,
         continuous=joint.continuous or joint.gear == "none",
         tolerances=Tolerances.of(file.tolerance),
         document=document,
@@ -284,11 +272,6 @@ def _controller(told: config.ControllerFile) -> Controller | None:
     )
 
 
-def _report_filter(drive: config.Drive | None) -> ReportFilter | None:
-    told = drive.torque_report_filter if drive else None
-    return None if told is None or told.time_constant_s == 0.0 else ReportFilter(told.order, told.time_constant_s)
-
-
 def _believed_effects(drive: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     found = {}
     for name, effect in all_effects().items():
@@ -301,9 +284,7 @@ def _believed_effects(drive: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     return found
 
 
-def _curve(friction: config.Friction | None, where: str) -> FrictionCurve | None:
-    if friction is None:
-        return None
+def _curve(friction: config.Friction, where: str) -> FrictionCurve | None:
     if friction.velocity_rad_s is not None and friction.torque_nm is not None:
         return FrictionCurve.through(np.array(friction.velocity_rad_s), np.array(friction.torque_nm), where=where)
     if friction.coulomb_nm is None:

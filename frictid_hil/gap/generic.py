@@ -5,6 +5,7 @@ They compete with the library; where one of them beats it, the honest answer is 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -75,11 +76,8 @@ def _of_velocity(views: Sequence[View]) -> dict[str, list[Array]]:
 
 
 def _late(v: View) -> Array:
-    columns = []
-    for lag_s in (0.01, 0.03, 0.08):
-        columns.append(lagged(v.slip, v.step_s, lag_s) - v.slip)
-        columns.append(lagged(v.velocity_rad_s, v.step_s, lag_s) - v.velocity_rad_s)
-    return np.stack(columns, axis=1)
+    parts = itertools.product((0.01, 0.03, 0.08), (v.slip, v.velocity_rad_s))
+    return np.stack([lagged(part, v.step_s, lag_s) - part for lag_s, part in parts], axis=1)
 
 
 def _of_time(views: Sequence[View]) -> dict[str, list[Array]]:

@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from frictid_hil.config.nominal import ReportFilter
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, STIFFNESS, Builder, Channel, Rows, Term, effect_prior, of_each_log, rows_of
-from frictid_hil.gap.experiment_set import Nominal, ReportFilter
+from frictid_hil.gap.experiment_set import Nominal
 from frictid_hil.gap.generic import WHOLE, families
 from frictid_hil.gap.noise import LOCAL_S
 from frictid_hil.gap.nuisances import nuisances

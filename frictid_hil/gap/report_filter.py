@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from frictid_hil.gap.experiment_set import ExperimentSet, ReportFilter
+from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.residuals import LowPass, recordings, reported
 
 
@@ -15,7 +15,7 @@ def as_meant(experiments: ExperimentSet) -> ExperimentSet:
     told = experiments.nominal.torque_report_filter
     if told is None or told.order == 1:
         return experiments
-    meant = (told, ReportFilter(1, told.time_constant_s))
+    meant = (told, told.model_copy(update={"order": 1}))
     left = [0.0, 0.0]
     for log in recordings(experiments):
         if log.view is None or log.plant_nm is None:

@@ -21,8 +21,9 @@ import numpy as np
 from numba import njit
 from scipy import interpolate, signal
 
+from frictid_hil.config.nominal import ReportFilter
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.experiment_set import LOG_COLUMNS, Controller, Experiment, ExperimentSet, Nominal, ReportFilter
+from frictid_hil.gap.experiment_set import LOG_COLUMNS, Controller, Experiment, ExperimentSet, Nominal
 from frictid_hil.simulation.inverse import View
 from frictid_hil.simulation.inverse_loops import bent, lagged
 from frictid_hil.simulation.joint import Payload
