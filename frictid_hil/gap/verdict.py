@@ -195,7 +195,7 @@ def _root_sum(sizes: Sequence[np.ndarray]) -> np.ndarray:
 def _place(channels: Sequence[Sampled]) -> str:
     """Generic functions that hold most of what no cause explains, in words."""
     loudest = max(channels, key=lambda channel: float(np.median(channel.generic)))
-    counts = Counter(e for draw in loudest.draws for e in draw.model.effects if e.startswith(FAMILY))
-    names = sorted(counts, key=lambda name: (-counts[name], name))[:2]
-    words = " and ".join(name.removeprefix(FAMILY) for name in names)
+    # Of two as common, the one that is drawn first; a draw's own are in no order.
+    counts = Counter(e for draw in loudest.draws for e in sorted(draw.model.effects) if e.startswith(FAMILY))
+    words = " and ".join(name.removeprefix(FAMILY) for name, _ in counts.most_common(2))
     return f"{loudest.posterior.channel.name}: {words}" if words else loudest.posterior.channel.name
