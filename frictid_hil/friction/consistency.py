@@ -56,6 +56,7 @@ _BESIDE = 1.0 / 12.0
 """Share of a cycle to either side of its turning point: half of the peak speed there, inertia and gravity as at it."""
 _AROUND = 0.2  # share of a cycle to either side of its middle in which the joint turns
 _STEPS = 1000.0
+_LATE = "torque or position are late: a filter that was not declared (`options: timing`), or reports of old figures"
 _LEAST_SAMPLES, _LEAST_AT_SPEED = 50, 12
 
 
@@ -81,14 +82,7 @@ def _delay(recording: CycleRecording, result: Estimate) -> Gate | None:
         f"the data ask for {1e3 * seen_s:+.2f} +- {2e3 * deviation_s:.2f} ms of torque delay beyond the declared one "
         f"(allowed {1e3 * allowed_s:.2f} ms)"
     )
-    return Gate.about(
-        "seen_delay",
-        abs(seen_s) <= allowed_s,
-        abs(seen_s),
-        allowed_s,
-        said,
-        "torque or position are late: a filter that was not declared (`options: timing`), or reports of old figures",
-    )
+    return Gate.at_most("seen_delay", abs(seen_s), allowed_s, said, _LATE)
 
 
 def _turnover(recording: CycleRecording, motion: Motion, result: Estimate) -> Gate | None:
@@ -113,15 +107,11 @@ def _turnover(recording: CycleRecording, motion: Motion, result: Estimate) -> Ga
             allowed_s = MOST_TURNOVER_S
         else:
             worst_s = 0.0
-    return Gate.about(
-        "turnover",
-        abs(worst_s) <= allowed_s,
-        abs(worst_s),
-        allowed_s,
+    said = (
         f"after a fast turning point friction turns over {1e3 * worst_s:+.1f} ms later than after the same travel in "
-        f"slow cycles (allowed {1e3 * allowed_s:.0f} ms)",
-        "torque or position are late: a filter that was not declared (`options: timing`), or reports of old figures",
+        f"slow cycles (allowed {1e3 * allowed_s:.0f} ms)"
     )
+    return Gate.at_most("turnover", abs(worst_s), allowed_s, said, _LATE)
 
 
 def _velocity(recording: CycleRecording, motion: Motion) -> Gate | None:
@@ -173,14 +163,8 @@ def _inertia(recording: CycleRecording, result: Estimate) -> Gate | None:
     passed = low < found + half and found - half < high and found + half > 0.0
     told = f", the robot file expects {expected:.4g}" if expected else ""
     said = f"inertia is {found:.4g} +- {half:.2g} kg m^2{told} (allowed {low:.3g} to {high:.3g})"
-    return Gate.about(
-        "inertia",
-        passed,
-        found,
-        low if found < low or not math.isfinite(high) else high,
-        said,
-        "torque that is late or cut off takes inertia away; or `expected` in the robot file is of another load",
-    )
+    cause = "torque that is late or cut off takes inertia away; or `expected` in the robot file is of another load"
+    return Gate.about("inertia", passed, found, low if found < low or not math.isfinite(high) else high, said, cause)
 
 
 def _flat(recording: CycleRecording) -> Gate:
@@ -196,7 +180,7 @@ def _flat(recording: CycleRecording) -> Gate:
             share, worst = max(share, counts[0] / torque.size), max(worst, spike)
     said = f"{100 * share:.2f} % of the samples pile up at the extreme of the torque (allowed {100 * FLAT_SHARE:.1f} %)"
     cause = "the reported torque is cut off: by a limit of the drive, or by its report"
-    return Gate.about("flat_tops", share <= FLAT_SHARE, share, FLAT_SHARE, said, cause)
+    return Gate.at_most("flat_tops", share, FLAT_SHARE, said, cause)
 
 
 def _repetition(recording: CycleRecording, motion: Motion, result: Estimate, most: float) -> Gate | None:
@@ -209,9 +193,8 @@ def _repetition(recording: CycleRecording, motion: Motion, result: Estimate, mos
     shares, allowed = np.abs(changed[0]) / level_nm, most + SURE * changed[1] / level_nm
     worst = int(np.argmax(shares))
     share = float(shares[worst])
-    return Gate.about(
+    return Gate.at_most(
         "repetition",
-        share <= allowed,
         share,
         allowed,
         f"cycle {recording.repeat.cycle} again: in part {worst + 2} of {shares.size + 1} its torque differs by "
@@ -231,9 +214,8 @@ def _elsewhere(recording: CycleRecording, motion: Motion, result: Estimate, most
     if not judged:
         return None
     worst, allowed, ratio, name = max(judged, key=lambda one: one[0] / one[1])
-    return Gate.about(
+    return Gate.at_most(
         "other_stretches",
-        worst <= allowed,
         worst,
         allowed,
         f"{name}: friction is {100 * ratio:.0f} % of the curve at the same speed (allowed {100 * allowed:.3g} % off)",

@@ -203,23 +203,14 @@ def _gates(
     rows: _Rows, knots: Array, odd: Array, half: Array, level: float, inertia: Measured | None, where: str
 ) -> tuple[Gate, ...]:
     widest = float(half.max()) / max(level, 1e-12)
-    gates = [
-        Gate(
-            "friction_interval",
-            widest <= MOST_INTERVAL,
-            widest,
-            MOST_INTERVAL,
-            f"the curve is known to +- {100 * widest:.0f} % of the friction at its worst speed "
-            f"(at most {100 * MOST_INTERVAL:.0f} %): record longer, or at more places and speeds",
-        ),
-        Gate(
-            "inertia_sign",
-            inertia is None or inertia.high > 0.0,
-            inertia.value if inertia else 0.0,
-            0.0,
-            "the inertia comes out negative: the torque has the wrong sign, is late, or another joint drives this one",
-        ),
-    ]
+    said = (
+        f"the curve is known to +- {100 * widest:.0f} % of the friction at its worst speed "
+        f"(at most {100 * MOST_INTERVAL:.0f} %): record longer, or at more places and speeds"
+    )
+    gates = [Gate("friction_interval", widest <= MOST_INTERVAL, widest, MOST_INTERVAL, said)]
+    said = "the inertia comes out negative: the torque has the wrong sign, is late, or another joint drives this one"
+    positive = inertia is None or inertia.high > 0.0
+    gates.append(Gate("inertia_sign", positive, inertia.value if inertia else 0.0, 0.0, said))
     middle = rows.bunch[rows.bunch.size // 2]
     curves = []
     for chosen in (rows.bunch <= middle, rows.bunch > middle):
@@ -236,14 +227,8 @@ def _gates(
     spread = np.hypot(first_half, second_half)
     known = (spread < 0.3 * level) & first_seen & second_seen
     beyond = float(np.max((np.abs(first - second) - spread)[known], initial=0.0)) / max(level, 1e-12)
-    gates.append(
-        Gate(
-            "halves_agree",
-            beyond <= MOST_APART,
-            beyond,
-            MOST_APART,
-            f"the curves of both halves of the recording lie {100 * beyond:.0f} % of the friction apart, beyond their "
-            "intervals: load, temperature or contact changed",
-        )
+    said = (
+        f"the curves of both halves of the recording lie {100 * beyond:.0f} % of the friction apart, beyond their "
+        "intervals: load, temperature or contact changed"
     )
-    return tuple(gates)
+    return (*gates, Gate("halves_agree", beyond <= MOST_APART, beyond, MOST_APART, said))

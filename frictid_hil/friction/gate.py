@@ -21,6 +21,11 @@ class Gate:
         """The same, where only a failure needs a cause."""
         return cls(name, bool(passed), float(value), float(limit), said if passed else f"{said}: {cause}")
 
+    @classmethod
+    def at_most(cls, name: str, value: float, limit: float, said: str, cause: str) -> Gate:
+        """The same, passed up to the limit."""
+        return cls.about(name, value <= limit, value, limit, said, cause)
+
 
 @dataclass(frozen=True, slots=True)
 class GateLimits:

@@ -70,9 +70,8 @@ def _tracking(recording: CycleRecording, motion: Motion, least: float, most: flo
     ratios = achieved_over_commanded(recording, motion)
     worst = int(np.argmax(np.abs(ratios - 1.0)))
     ratio = float(ratios[worst])
-    passed = least <= ratio <= most
     said = f"cycle {worst + 1} reached {100 * ratio:.1f} % of its commanded peak speed"
-    if passed:
+    if least <= ratio <= most:
         return Gate("tracking", True, ratio, least, f"tracking: {said} at worst")
     others = [k for k, other in enumerate(ratios) if k != worst and not least <= other <= most]
     if others:
@@ -82,13 +81,8 @@ def _tracking(recording: CycleRecording, motion: Motion, least: float, most: flo
         if ratio < 1
         else "the position loop overshoots or hunts"
     )
-    return Gate(
-        "tracking",
-        False,
-        ratio,
-        least if ratio < 1 else most,
-        f"tracking: {said} (allowed {100 * least:.3g} to {100 * most:.3g} %): {cause}",
-    )
+    said = f"tracking: {said} (allowed {100 * least:.3g} to {100 * most:.3g} %)"
+    return Gate.about("tracking", False, ratio, least if ratio < 1 else most, said, cause)
 
 
 def _roughness(recording: CycleRecording, result: Estimate, most: float) -> Gate:
@@ -97,60 +91,35 @@ def _roughness(recording: CycleRecording, result: Estimate, most: float) -> Gate
     fast = torque - uniform_filter1d(torque, max(3, round(_ROUGH_S / step_s) | 1))
     level = float(np.mean(result.curve.torque_nm))
     share = float(np.sqrt(np.mean(fast**2))) / level
-    passed = share <= most
     said = f"torque jitters by {100 * share:.1f} % of the friction (allowed {100 * most:.3g} %)"
-    return Gate(
-        "high_frequency_torque",
-        passed,
-        share,
-        most,
-        said if passed else f"{said}: the position loop oscillates, or the torque signal is too noisy",
-    )
+    cause = "the position loop oscillates, or the torque signal is too noisy"
+    return Gate.at_most("high_frequency_torque", share, most, said, cause)
 
 
 def _samples(result: Estimate, least: float) -> Gate:
     fewest = int(min(result.pairs.samples_plus.min(), result.pairs.samples_minus.min()))
-    passed = fewest >= least
     said = f"the smallest window averages {fewest} samples (at least {least:g} needed)"
-    return Gate(
-        "samples_per_window",
-        passed,
-        float(fewest),
-        least,
-        said if passed else f"{said}: raise the rate or the travel, or lower the peak speed",
-    )
+    cause = "raise the rate or the travel, or lower the peak speed"
+    return Gate.about("samples_per_window", fewest >= least, fewest, least, said, cause)
 
 
 def _lateness(recording: CycleRecording, most: float) -> Gate:
-    share = recording.late_cycles / len(recording.time_s)
-    passed = share <= most
     late = recording.late_cycles
+    share = late / len(recording.time_s)
     said = f"{late} control cycles were late or missed, {100 * share:.2f} % (allowed {100 * most:.3g} %)"
-    return Gate(
-        "late_cycles",
-        passed,
-        share,
-        most,
-        said if passed else f"{said}: give the process real-time priority, or lower the rate",
-    )
+    return Gate.at_most("late_cycles", share, most, said, "give the process real-time priority, or lower the rate")
 
 
 def _asymmetry(result: Estimate, most: float) -> Gate:
     shares = np.abs(result.asymmetry_nm) / np.asarray(result.curve.torque_nm)
     worst = int(np.argmax(shares))
     share = float(shares[worst])
-    passed = share <= most
     said = (
         f"at pair {worst + 1} of {shares.size} the two directions lie {100 * share:.1f} % to either side of their mean "
         f"(allowed {100 * most:.3g} %)"
     )
-    return Gate(
-        "direction_asymmetry",
-        passed,
-        share,
-        most,
-        said if passed else f"{said}: a load that works one way, torque saturating one way, or a damaged gear",
-    )
+    cause = "a load that works one way, torque saturating one way, or a damaged gear"
+    return Gate.at_most("direction_asymmetry", share, most, said, cause)
 
 
 def _kinks(recording: CycleRecording, result: Estimate, most: float) -> Gate:
@@ -165,23 +134,15 @@ def _kinks(recording: CycleRecording, result: Estimate, most: float) -> Gate:
     leaves = np.abs(f[1:-1] - line) / f.mean()
     worst = int(np.argmax(leaves))
     share = float(leaves[worst])
-    passed = share <= most
     said = (
         f"pair {slow + worst + 2} of {pairs} leaves the line through its neighbours by {100 * share:.1f} % of the "
         f"friction (allowed {100 * most:.3g} %)"
     )
-    return Gate(
-        "straightness",
-        passed,
-        share,
-        most,
-        said if passed else f"{said}: that cycle was disturbed; run it again",
-    )
+    return Gate.at_most("straightness", share, most, said, "that cycle was disturbed; run it again")
 
 
 def _saturation(recording: CycleRecording, most: float) -> Gate:
-    high = np.abs(recording.torque_nm) >= _AT_LIMIT * recording.torque_limit_nm
-    share = float(np.mean(high))
+    share = float(np.mean(np.abs(recording.torque_nm) >= _AT_LIMIT * recording.torque_limit_nm))
     said = f"torque stood at its limit in {100 * share:.2f} % of the samples (allowed {100 * most:.3g} %)"
     if recording.limited_share > share:
         share = recording.limited_share
@@ -189,14 +150,8 @@ def _saturation(recording: CycleRecording, most: float) -> Gate:
             f"the drive said in {100 * share:.2f} % of the samples that one of its limits was active "
             f"(statusword bit 11; allowed {100 * most:.3g} %)"
         )
-    passed = share <= most
-    return Gate(
-        "saturation",
-        passed,
-        share,
-        most,
-        said if passed else f"{said}: raise the travel (peak torque grows as V^2/A) or lower the peak speed",
-    )
+    cause = "raise the travel (peak torque grows as V^2/A) or lower the peak speed"
+    return Gate.at_most("saturation", share, most, said, cause)
 
 
 def _time_skew(skew: TimeSkew) -> Gate:
@@ -206,10 +161,10 @@ def _time_skew(skew: TimeSkew) -> Gate:
         f"{skew.apart:.1f} standard deviations apart (allowed {MOST_APART:g})"
     )
     cause = (
-        f"{said}: an undeclared filter or a wrong `options: timing` (the measured one was used), or what shook was not "
-        "the joint's own inertia"
+        "an undeclared filter or a wrong `options: timing` (the measured one was used), or what shook was not the "
+        "joint's own inertia"
     )
-    return Gate("time_skew", skew.agree, skew.apart, MOST_APART, said if skew.agree else cause)
+    return Gate.about("time_skew", skew.agree, skew.apart, MOST_APART, said, cause)
 
 
 def _drift(recording: CycleRecording, drift: Drift, most: float) -> Gate:
@@ -221,21 +176,14 @@ def _drift(recording: CycleRecording, drift: Drift, most: float) -> Gate:
         f"{drift.apart_s:.1f} s later: {100 * change:.1f} % over the run (allowed {100 * most:.3g} %, "
         f"and the {100 * drift.over(duration_s, drift.chance):.1f} % that torque noise and steps may feign)"
     )
-    return Gate("drift", passed, change, most, said if passed else f"{said}: warm the joint up first")
+    return Gate.about("drift", passed, change, most, said, "warm the joint up first")
 
 
 def _resonance(recording: CycleRecording, resonance_hz: float, most: float) -> Gate:
     fastest_hz = float(recording.procedure.angular_frequencies_rad_s[-1]) / (2 * math.pi)
     share = fastest_hz / resonance_hz
-    passed = share <= most
     said = (
         f"the fastest cycle, {fastest_hz:.2f} Hz, is {100 * share:.0f} % (allowed {100 * most:.3g} %) "
         f"of the link's resonance at {resonance_hz:.1f} Hz"
     )
-    return Gate(
-        "link_resonance",
-        passed,
-        share,
-        most,
-        said if passed else f"{said}: raise the travel, or lower the peak speed",
-    )
+    return Gate.at_most("link_resonance", share, most, said, "raise the travel, or lower the peak speed")
