@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -90,6 +91,39 @@ def linear(
         parameters=lambda shape, coefficients: dict(zip(columns, map(float, coefficients), strict=True)),
         first_coefficient=first_coefficient,
         of_speed=of_speed,
+    )
+
+
+def shared(
+    shapes: tuple[Shape, ...],
+    column: Callable[[View, Shape], Array],
+    first_coefficient: tuple[float, float] = (0.0, math.inf),
+    **more: Any,
+) -> InverseForm:
+    """The form of an effect of a ``share`` and a shape: N m per unit of the share along a view, (n,)."""
+    return InverseForm(
+        shapes=shapes,
+        regressors=lambda views, shape: [column(v, shape)[:, None] for v in views],
+        parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
+        first_coefficient=first_coefficient,
+        **more,
+    )
+
+
+def through_transmission(
+    scaled: str,
+    shapes: tuple[Shape, ...],
+    shapes_for: Callable[[Sequence[View]], tuple[Shape, ...]],
+    regressors: Callable[[Sequence[View], Shape], list[Array]],
+) -> InverseForm:
+    """The form of a link that swings behind its gear: one coefficient, which scales a parameter of the shape."""
+    return InverseForm(
+        shapes=shapes,
+        shapes_for=shapes_for,
+        swings=True,
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {**shape, scaled: shape[scaled] * max(0.05, float(coefficients[0]))},
+        first_coefficient=(0.2, 4.0),
     )
 
 

@@ -21,11 +21,28 @@ SUBSTEP_S = 1e-4  # longest sub-step of the physics
 _NOISE_BLOCK = 4096
 
 
+class _Read:
+    """A number that was read at the end of the last ``advance``."""
+
+    def __init__(self, slot: int) -> None:
+        self._slot = slot
+
+    def __get__(self, loop: ServoLoop, owner: type[ServoLoop]) -> float:
+        return loop._row[self._slot]
+
+
 class ServoLoop:
     """One joint under its drive; at first unpowered, brake engaged, where its encoder reads ``position_rad``.
 
     The seed is that of the noise on the reported torque, the period that of the drive's control loop.
     """
+
+    measured_position_rad = _Read(plant.READ_POSITION)  # the encoder's
+    position_rad = _Read(plant.READ_TRUE_POSITION)  # of the link
+    true_velocity_rad_s = _Read(plant.READ_TRUE_VELOCITY)  # of the link
+    velocity_rad_s = _Read(plant.READ_VELOCITY)  # the drive's own estimate
+    external_torque_nm = _Read(plant.READ_EXTERNAL)  # what a person applies to the link
+    temperature_c = _Read(plant.READ_TEMPERATURE)  # at the gear
 
     def __init__(self, model: JointModel, *, period_s: float = 0.001, seed: int = 0, position_rad: float = 0.0) -> None:
         self.model = model
@@ -75,11 +92,7 @@ class ServoLoop:
         self._parameters[plant.BRAKED] = float(engaged)
 
     def set_mode(self, mode: int) -> None:
-        """8 position, 9 velocity, 10 torque (values of CiA-402 object 6060), without a jump of torque.
-
-        Raises:
-            UsageError: another mode.
-        """
+        """8 position, 9 velocity, 10 torque (CiA-402, 6060), without a jump of torque; ``UsageError`` for others."""
         if mode not in (plant.POSITION_MODE, plant.VELOCITY_MODE, plant.TORQUE_MODE):
             raise UsageError(f"no such mode: {mode}; there are 8 (position), 9 (velocity), 10 (torque)")
         if mode != self.mode:
@@ -188,39 +201,9 @@ class ServoLoop:
         return round(self._row[plant.READ_POSITION] / (self._step_rad or 1e-6))
 
     @property
-    def measured_position_rad(self) -> float:
-        """The encoder's position."""
-        return self._row[plant.READ_POSITION]
-
-    @property
-    def position_rad(self) -> float:
-        """True position of the link."""
-        return self._row[plant.READ_TRUE_POSITION]
-
-    @property
-    def true_velocity_rad_s(self) -> float:
-        """True velocity of the link."""
-        return self._row[plant.READ_TRUE_VELOCITY]
-
-    @property
-    def velocity_rad_s(self) -> float:
-        """The drive's own estimate."""
-        return self._row[plant.READ_VELOCITY]
-
-    @property
     def torque_nm(self) -> float:
         """Torque as reported: mean of the last ``advance``, with noise, not rounded to the drive's steps."""
         return self._row[plant.READ_TORQUE] + self._torque_noise_nm
-
-    @property
-    def external_torque_nm(self) -> float:
-        """What a person applies to the link."""
-        return self._row[plant.READ_EXTERNAL]
-
-    @property
-    def temperature_c(self) -> float:
-        """At the gear."""
-        return self._row[plant.READ_TEMPERATURE]
 
     @property
     def following_error_rad(self) -> float:

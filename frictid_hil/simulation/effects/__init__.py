@@ -20,11 +20,7 @@ GROUP = "frictid_hil.effects"  # entry points of users' own effects
 
 @functools.cache
 def all_effects() -> dict[str, Effect]:
-    """Every effect by name, in alphabetical order.
-
-    Raises:
-        UsageError: an effect of a user cannot be loaded, is none, or takes a name that is taken.
-    """
+    """By name, alphabetically; ``UsageError`` for one that cannot be loaded, is none, or has a taken name."""
     effects: dict[str, Effect] = {}
     for module in sorted(pkgutil.iter_modules(__path__), key=lambda found: found.name):
         effect: Effect = importlib.import_module(f"{__name__}.{module.name}").EFFECT

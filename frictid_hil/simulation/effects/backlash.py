@@ -9,7 +9,7 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import Link, TrackingForm
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View, behind_transmission, grid, most_telling
+from frictid_hil.simulation.inverse import Shape, View, behind_transmission, grid, most_telling, through_transmission
 
 
 def play(play_rad: float, gap_rad: float) -> float:
@@ -128,15 +128,5 @@ EFFECT = Effect(
         order=40,
         looks_like=("stiction_breakaway",),
     ),
-    inverse=InverseForm(
-        shapes=SHAPES,
-        shapes_for=shapes_for,
-        swings=True,
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {
-            **shape,
-            "gap_rad": shape["gap_rad"] * max(0.05, float(coefficients[0])),
-        },
-        first_coefficient=(0.2, 4.0),
-    ),
+    inverse=through_transmission("gap_rad", SHAPES, shapes_for, regressors),
 )

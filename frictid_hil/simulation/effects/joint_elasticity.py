@@ -8,7 +8,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View, behind_transmission, grid, most_telling
+from frictid_hil.simulation.inverse import Shape, View, behind_transmission, grid, most_telling, through_transmission
 
 
 def coupling(coupling_nm_per_rad: float, compliance_rad_per_nm: float) -> float:
@@ -85,15 +85,5 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.FREQUENCY, Region.ACCELERATION)),
     hooks=(Hook("coupling", coupling), Hook("coupling_damping", coupling_damping)),
     illustrate=_illustrate,
-    inverse=InverseForm(
-        shapes=SHAPES,
-        shapes_for=shapes_for,
-        swings=True,
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {
-            "compliance_rad_per_nm": shape["compliance_rad_per_nm"] * max(0.05, float(coefficients[0])),
-            "relaxation_s": shape["relaxation_s"],
-        },
-        first_coefficient=(0.2, 4.0),
-    ),
+    inverse=through_transmission("compliance_rad_per_nm", SHAPES, shapes_for, regressors),
 )

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
+from frictid_hil.simulation.inverse import Shape, View, shared
 
 
 def level(level_nm: float, coulomb_nm: float, share: float) -> float:
@@ -48,12 +48,12 @@ def settle(state: Any, at: int, velocity_rad_s: float) -> None:
     state[at] = 0.0 if velocity_rad_s == 0.0 else math.copysign(1.0, velocity_rad_s)
 
 
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+def column(v: View, shape: Shape) -> Array:
     """What the soft element carries instead of the stiff spring, per share."""
     from frictid_hil.simulation.inverse_loops import soft_spring
 
-    numbers = shape["distance_rad"], shape["loop_exponent"], shape["loop_beta"]
-    return [(v.coulomb_nm * (soft_spring(v.position_rad, *numbers) - v.slip))[:, None] for v in views]
+    soft = soft_spring(v.position_rad, shape["distance_rad"], shape["loop_exponent"], shape["loop_beta"])
+    return np.asarray(v.coulomb_nm * (soft - v.slip))
 
 
 def _illustrate(p: Mapping[str, float]) -> Illustration:
@@ -94,15 +94,13 @@ EFFECT = Effect(
         Hook("settle", settle),
     ),
     illustrate=_illustrate,
-    inverse=InverseForm(
-        shapes=tuple(
+    inverse=shared(
+        tuple(
             {"distance_rad": d, "loop_exponent": n, "loop_beta": b}
             for d in (0.001, 0.002, 0.004, 0.007, 0.012, 0.02, 0.035)
             for n, b in ((1.0, 1.0), (1.0, 0.5), (2.0, 0.6))
         ),
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
-        first_coefficient=(0.0, math.inf),
+        column,
     ),
     state_size=1,
 )

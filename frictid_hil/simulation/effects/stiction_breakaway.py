@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
+from frictid_hil.simulation.inverse import Shape, View, grid, shared
 
 
 def level(level_nm: float, coulomb_nm: float, state: Any, at: int, share: float) -> float:
@@ -34,12 +33,12 @@ def settle(state: Any, at: int, velocity_rad_s: float, dwell_time_s: float, trav
     state[at] = 1.0 / (1.0 + dwell_time_s * abs(velocity_rad_s) / travel_rad)
 
 
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+def column(v: View, shape: Shape) -> Array:
     """The level raised by rest, per share."""
     from frictid_hil.simulation.inverse_loops import rest_memory
 
-    numbers = shape["dwell_time_s"], shape["travel_rad"]
-    return [(v.coulomb_nm * v.slip * rest_memory(v.velocity_rad_s, v.step_s, *numbers))[:, None] for v in views]
+    memory = rest_memory(v.velocity_rad_s, v.step_s, shape["dwell_time_s"], shape["travel_rad"])
+    return np.asarray(v.coulomb_nm * v.slip * memory)
 
 
 EFFECT = Effect(
@@ -67,11 +66,6 @@ EFFECT = Effect(
         "rise of break-away / Coulomb level",
         {"break-away": lambda dwell: p["share"] * (1.0 - np.exp(-dwell / p["dwell_time_s"]))},
     ),
-    inverse=InverseForm(
-        shapes=grid(dwell_time_s=(0.08, 0.25, 0.8, 2.5), travel_rad=(3e-4, 1e-3, 3e-3, 1e-2)),
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
-        first_coefficient=(0.0, math.inf),
-    ),
+    inverse=shared(grid(dwell_time_s=(0.08, 0.25, 0.8, 2.5), travel_rad=(3e-4, 1e-3, 3e-3, 1e-2)), column),
     state_size=1,
 )

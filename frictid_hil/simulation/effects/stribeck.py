@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
+from frictid_hil.simulation.inverse import Shape, View, grid, shared
 
 
 def level(
@@ -26,16 +25,13 @@ def level(
     return level_nm + share * coulomb_nm * math.exp(-((abs(velocity_rad_s) / stribeck_velocity_rad_s) ** exponent))
 
 
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+def column(v: View, shape: Shape) -> Array:
     """The raised level along the motion, per share; a bristle follows it over some travel."""
     from frictid_hil.simulation.inverse_loops import followed
 
-    columns = []
-    for v in views:
-        speed = np.abs(v.velocity_rad_s) / shape["stribeck_velocity_rad_s"]
-        raised = v.coulomb_nm * v.slip * np.exp(-(speed ** shape["exponent"]))
-        columns.append(followed(raised, v.position_rad, v.gradual_rad)[:, None])
-    return columns
+    speed = np.abs(v.velocity_rad_s) / shape["stribeck_velocity_rad_s"]
+    raised = v.coulomb_nm * v.slip * np.exp(-(speed ** shape["exponent"]))
+    return np.asarray(followed(raised, v.position_rad, v.gradual_rad))
 
 
 EFFECT = Effect(
@@ -72,11 +68,9 @@ EFFECT = Effect(
             14.0,
         ),
     ),
-    inverse=InverseForm(
-        shapes=grid(stribeck_velocity_rad_s=(0.008, 0.015, 0.025, 0.04, 0.06, 0.09, 0.13, 0.2), exponent=(1.0, 2.0)),
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
-        first_coefficient=(0.0, math.inf),
+    inverse=shared(
+        grid(stribeck_velocity_rad_s=(0.008, 0.015, 0.025, 0.04, 0.06, 0.09, 0.13, 0.2), exponent=(1.0, 2.0)),
+        column,
         of_speed=True,
     ),
 )

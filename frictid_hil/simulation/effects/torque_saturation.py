@@ -36,10 +36,7 @@ def reported(torque_nm: Array, limit_share: float, step_s: float, limit_nm: floa
 
 
 def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
-    """Around the highest torque reported, where more was asked for; none without a stated limit to share.
-
-    A shorter peak than ``LASTS_S`` is how a jump of the command meets the controller's ticks, and no flat top.
-    """
+    """Around the highest torque reported, where more was asked for ``LASTS_S``; none without a stated limit."""
     limit = views[0].limit_nm
     asked = 0.0
     for v in views:

@@ -9,7 +9,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
+from frictid_hil.simulation.inverse import Shape, View, grid, shared
 
 
 def rate(
@@ -24,15 +24,12 @@ def rate(
     return rate_nm + (bent_nm if velocity_rad_s >= 0.0 else -bent_nm)
 
 
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+def column(v: View, shape: Shape) -> Array:
     """The bend along the motion, per share."""
-    columns: list[Array] = []
-    for v in views:
-        relative = 1.0 + np.abs(v.velocity_rad_s) / shape["knee_rad_s"]
-        bend = shape["bend"]
-        bent = np.log(relative) if abs(bend) < 1e-6 else (relative**bend - 1.0) / bend
-        columns.append((v.coulomb_nm * np.sign(v.velocity_rad_s) * bent)[:, None])
-    return columns
+    relative = 1.0 + np.abs(v.velocity_rad_s) / shape["knee_rad_s"]
+    bend = shape["bend"]
+    bent = np.log(relative) if abs(bend) < 1e-6 else (relative**bend - 1.0) / bend
+    return np.asarray(v.coulomb_nm * np.sign(v.velocity_rad_s) * bent)
 
 
 def shapes(views: Sequence[View]) -> tuple[Shape, ...]:
@@ -73,11 +70,5 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND,)),
     hooks=(Hook("rate", rate),),
     illustrate=_illustrate,
-    inverse=InverseForm(
-        shapes=BENDS,
-        shapes_for=shapes,
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
-        of_speed=True,
-    ),
+    inverse=shared(BENDS, column, (-math.inf, math.inf), shapes_for=shapes, of_speed=True),
 )
