@@ -73,10 +73,7 @@ def assignments(cases: int, seed: int) -> tuple[Assignment, ...]:
 
 
 def draw_case(index: int, seed: int, assignment: Assignment, experiments: tuple[str, ...] = FULL) -> Case:
-    """The case at an index; the same from the same arguments, whatever else is drawn.
-
-    A joint that its controller cannot hold with the effects on is drawn anew.
-    """
+    """The same from the same arguments, whatever else is drawn; anew where its controller cannot hold the joint."""
     for attempt in range(50):
         rng = np.random.default_rng([seed, 202, index, attempt])
         noise_seed = [seed, 303, index, attempt]

@@ -310,8 +310,7 @@ def run(
 ) -> tuple[Array, Array, Array, float]:
     """One experiment in closed loop, from rest at the first set-point.
 
-    Reported position, the drive's velocity, the torque applied (before sensor noise), each shape (n,), and the thermal
-    state at the end.
+    Position and velocity as reported, torque applied (before noise), shape (n,) each, and the thermal state at the end.
     """
     n, period = command.size, control.tick
     h = period / control.substeps

@@ -286,8 +286,7 @@ def _figure(answer: Answer, when: str, figure: str) -> float | None:
 def _closed(figure: str, cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
     """Share of the closable gap that was closed on validation logs, from the tool's own figures and truth's floor.
 
-    Nothing is applied on the verdict ``ambiguous``, so that nothing can close: such joints are counted apart, and
-    once more as if nothing had been closed of them.
+    Nothing is applied where it is ``ambiguous``: such joints are counted apart, and once more as with nothing closed.
     """
     shares, undecided, without = [], 0, 0
     for truth, answer in cases:

@@ -122,10 +122,7 @@ _SIZES: dict[str, tuple[tuple[float, float], tuple[int, ...], tuple[float, float
 
 
 def draw_wide(index: int, seed: int, kind: str) -> Drawn:
-    """One case; the same from the same arguments.
-
-    A joint that its controller cannot hold, or whose withheld effect cannot be seen, is drawn anew.
-    """
+    """The same from the same arguments; drawn anew where it cannot be held, or what is withheld not be seen."""
     for attempt in range(200):
         rng = np.random.default_rng([seed, 404, index, attempt])
         setting = _setting(rng)

@@ -180,11 +180,7 @@ def _gains(rng: np.random.Generator, m: Model) -> Gains:
 
 
 def run(m: Model, gains: Gains, command: Array) -> tuple[Array, Array]:
-    """(position, mean torque since the tick before) at the ticks, closed loop, from rest; shape (n,) each.
-
-    Raises:
-        UsageError: MuJoCo with ``dcmotor`` is not installed.
-    """
+    """(position, mean torque since the last tick) at the ticks, from rest, (n,) each; ``UsageError`` without MuJoCo."""
     try:
         library = importlib.import_module("mujoco")
         model = library.MjModel.from_xml_string(_xml(m))

@@ -53,11 +53,7 @@ class Cleaned:
 
 
 def cleaned(recording: CycleRecording, notes: list[str]) -> Cleaned:
-    """The recording, ready for an estimator; the notes get what a person should know.
-
-    Raises:
-        IdentificationError: a window is empty, or columns do not fit together.
-    """
+    """Ready for an estimator, what a person should know in the notes; ``IdentificationError`` for an empty window."""
     recording, shakes = without_shakes(recording)
     if shakes:
         notes.append(f"{shakes} missed set-points shook the joint; its torque was taken from beside them")

@@ -39,10 +39,8 @@ class Solved:
 def solve(x: Array, targets: Array, bunch: NDArray[np.int64], priors: list[Prior], where: str) -> Solved:
     """Least squares of every target, shape (n, 1 + m), on the same columns x, shape (n, size).
 
-    Rows of the same number in ``bunch`` err together. Priors are on the coefficients of the first target.
-
-    Raises:
-        IdentificationError: the columns are linearly dependent.
+    Rows of the same number in ``bunch`` err together. Priors are on the coefficients of the first target. Columns that
+    are linearly dependent are an ``IdentificationError``.
     """
     scale = np.linalg.norm(x, axis=0)
     scale[scale < 1e-9 * scale.max()] = np.inf  # a column of nothing (ripple filtered away) gets coefficient 0
@@ -85,11 +83,9 @@ def solve(x: Array, targets: Array, bunch: NDArray[np.int64], priors: list[Prior
 def _spread(left: Array, gram: Array, scores: Array) -> tuple[Array, Array]:
     """(what each quarter cycle's misfit adds to the coefficients, shape (quarters, size); their freedom, (size,)).
 
-    A quarter that decides a coefficient alone pulls the solution to itself, and its misfit comes out too small by
-    (1 - h)^(1/2), h being its share of what is known; each is divided by it (the cluster-robust CR2 of Bell and
-    McCaffrey, 2002: unbiased where quarters are alike). Leaving each out instead divides by 1 - h, which made the
-    slowest knots, seen by a few quarters, look four times as uncertain as they are. The freedom is that of the same
-    paper: of the sum of squares that alike and independent rows would give.
+    Cluster-robust CR2 of Bell and McCaffrey (2002): a quarter that decides a coefficient alone pulls the solution to
+    itself, so that its misfit is divided by (1 - h)^(1/2), h being its share of what is known. By 1 - h instead, the
+    slowest knots looked four times as uncertain as they are.
     """
     values, vectors = np.linalg.eigh(left)
     root = vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))  # root @ root.T is the inverse

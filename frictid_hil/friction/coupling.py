@@ -84,10 +84,7 @@ def without_gravity(motion: Motion, solved: Fit, others: Pull | None) -> tuple[M
 
 
 def posture(motion: Motion) -> Array:
-    """What changes along the travel while other joints move: inertia, and velocity products, shape (n, 5).
-
-    A joint that moves alone has the same inertia everywhere, and no torque that goes with the speed squared.
-    """
+    """Inertia along the travel and velocity products, which change only while other joints move, shape (n, 5)."""
     q = motion.position_rad - np.mean(motion.position_rad)
     a, squared = motion.acceleration_rad_s2, motion.velocity_rad_s**2
     return np.column_stack([q * a, q**2 * a, squared, q * squared, q**2 * squared])
@@ -110,12 +107,10 @@ def _acceleration(other: Companion, motion: Motion) -> Array:
 
 
 def coupled_inertia(stretches: Mapping[str, CycleRecording]) -> dict[str, dict[str, tuple[float, float]]]:
-    """The off-diagonal part of the inertia matrix, from every joint's recording of the coupling stretch, on one clock.
+    """M_ij and its standard deviation by joint and other joint, kg m2 (kg, kg m where axes are linear), i not j.
 
-    Per joint and other joint: M_ij and its standard deviation, kg m2 (kg, kg m where axes are linear).
-
-    Raises:
-        IdentificationError: some joint did not shake, or not at a frequency of its own.
+    From every joint's recording of the coupling stretch, on one clock; ``IdentificationError`` where some joint did not
+    shake, or not at a frequency of its own.
     """
     names = list(stretches)
     motions = {name: synchronised(stretch) for name, stretch in stretches.items()}
@@ -139,12 +134,9 @@ def coupled_inertia(stretches: Mapping[str, CycleRecording]) -> dict[str, dict[s
 def companions(
     stretches: Mapping[str, CycleRecording], cycles: Mapping[str, CycleRecording], joint: str
 ) -> tuple[Companion, ...]:
-    """The joints that moved along with one, with what each of them takes.
+    """The joints that moved along with one, with what each of them takes; raises as ``coupled_inertia``.
 
     Stretches are recordings of the coupling stretch; times of the cycles are on the clock of ``joint``'s.
-
-    Raises:
-        IdentificationError: see ``coupled_inertia``.
     """
     known = coupled_inertia(stretches)[joint]
     return tuple(

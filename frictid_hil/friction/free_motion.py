@@ -77,8 +77,7 @@ def free_motion(
 ) -> FreeMotion:
     """Identify friction, inertia and gravity from any motion.
 
-    Raises:
-        IdentificationError: one direction only, too little motion, or parts that cannot be told apart.
+    ``IdentificationError`` for one direction only, too little motion, or parts that cannot be told apart.
     """
     gravity = not prismatic and float(np.ptp(position_rad)) >= _LEAST_GRAVITY_TRAVEL_RAD
     rows = _rows(time_s, position_rad, torque_nm, torque_delay_s, gravity, where)

@@ -103,8 +103,7 @@ def _means(
 ) -> list[tuple[Array, Array, NDArray[np.int64]]]:
     """Mean velocity, mean torque and count of the samples in each window, cycle by cycle.
 
-    The samples are split into stretches that lie wholly inside or outside every window of one cycle. There are a few
-    dozen of them, so each column is summed once and nothing of its length is copied.
+    Each column is summed once, over the few dozen stretches that lie wholly inside or outside every window.
     """
     splits = np.zeros(velocity.size + 1, dtype=np.bool_)
     splits[bounds] = True

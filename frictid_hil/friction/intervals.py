@@ -213,10 +213,9 @@ def repeated(recording: CycleRecording, motion: Motion, pairs: IdentifiedPairs, 
 
 
 def _drift_shares(recording: CycleRecording, seen_s: Array, drift: Drift | None) -> Array:
-    """Standard deviation that a steady drift over the run means for what was seen at these times, as shares of it.
+    """One sigma of a steady drift over the run for what was seen at these times, as shares of it.
 
-    The truth may be the friction at any moment of the run, the farthest included: a rectangular distribution as wide
-    as the drift and one standard deviation of it, that of two looks at one F_n.
+    The truth may be the friction of any moment, the farthest included: a rectangle as wide as the drift and its chance.
     """
     if drift is None:
         return np.zeros_like(seen_s)
@@ -227,10 +226,7 @@ def _drift_shares(recording: CycleRecording, seen_s: Array, drift: Drift | None)
 
 
 def _apart(pairs: IdentifiedPairs, solved: Fit, scatter_nm: Array, others: Beside, weights: Array) -> Array:
-    """What the distance between windows and least squares says beyond the scatter of both, shape (N,).
-
-    Place and load move both, unlike: what they explain of the distance is a term of its own.
-    """
+    """How far windows and least squares lie apart beyond the scatter of both and what ``others`` explain, (N,)."""
     hats = hat_functions(pairs.mean_speed_rad_s, solved.knots)
     odd = solved.blocks.odd
     known = np.einsum("nj,jk,nk->n", hats, solved.covariance[odd, odd], hats)
@@ -248,9 +244,7 @@ def _scatter(recording: CycleRecording, motion: Motion, solved: Fit | None) -> A
     """Standard deviation of each F_n from the disagreement of its four half windows, shape (N,).
 
     Forwards the early half covers the lower half of the travel, backwards the late one does. Lower minus upper halves,
-    both ways with the sign of the motion, is free of gravity, of asymmetry and of what is left of inertia: it holds
-    the scatter of all four halves, and what friction has more at one end of the travel (``_by_chance``). F_n is their
-    mean, hence the quarter.
+    both ways with the sign of the motion, is free of gravity, asymmetry and inertia. F_n is their mean: a quarter.
     """
     procedure = recording.procedure
     torque = motion.torque_nm
@@ -277,9 +271,8 @@ def _scatter(recording: CycleRecording, motion: Motion, solved: Fit | None) -> A
 def _by_chance(recording: CycleRecording, single: Array) -> tuple[Array, float]:
     """The differences of half windows without what comes again in every cycle, and the freedom that is left to each.
 
-    Every cycle passes the same places: friction that varies along the travel makes the same difference in all of them,
-    and a gear's loss one that grows with the inertial torque, n^2. Both are as large above the middle as they are small
-    below and leave the mean alone; what their bend leaves in it is ``beside``.
+    Friction along the travel makes the same difference in all cycles, a gear's loss one that grows with n^2; both leave
+    the mean alone, but for their bend (``beside``).
     """
     procedure = recording.procedure
     if procedure.cycles < _ENOUGH:

@@ -26,10 +26,7 @@ class CurveDistance:
 
 
 def curve_distance(curve: FrictionCurve, reference: FrictionCurve, velocity_rad_s: float) -> CurveDistance:
-    """E(curve, reference) of (15) and its percentages.
-
-    The identified curve's measured range is the second interval, cut at V, the upper end of the first.
-    """
+    """E(curve, reference) of (15) and its percentages, over [0, V] and over the curve's measured range cut at V."""
     low, high = curve.measured_range_rad_s
     high = min(high, velocity_rad_s)
     whole, whole_mean = rms_and_mean(curve, reference, 0.0, velocity_rad_s)
@@ -59,10 +56,7 @@ def rms_and_mean(
 
 
 def rms(time_s: Array, values: Array) -> float:
-    """sqrt(1/T_e integral x^2 dt) of (25), by trapezoids on the recorded time; unit of ``values``.
-
-    V_s is this of the velocity, F_s of the external torque.
-    """
+    """sqrt(1/T_e integral x^2 dt) of (25), by trapezoids on the recorded time (V_s, F_s); unit of ``values``."""
     square = np.asarray(values, dtype=np.float64) ** 2
     step_s = np.diff(time_s)
     return float(np.sqrt(np.sum(step_s * (square[1:] + square[:-1])) / (2 * np.sum(step_s))))

@@ -18,8 +18,7 @@ _WORST_MISFIT = 0.1  # share of the travel; a path further than this from the tr
 def cycles_start_s(time_s: Array, position_rad: Array, procedure: Procedure, *, where: str = "") -> float:
     """Time at which cycle 1 begins, on the clock of ``time_s``; the path is commanded or measured, shape (n,).
 
-    Raises:
-        IdentificationError: the recording does not hold this motion.
+    A recording that does not hold this motion is an ``IdentificationError``.
     """
     time = np.asarray(time_s, dtype=np.float64)
     path = np.asarray(position_rad, dtype=np.float64)

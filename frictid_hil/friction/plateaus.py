@@ -65,8 +65,7 @@ def plateaus(
 ) -> PlateauEstimate:
     """Pairs of every speed that the recording holds in both directions, slowest first, and their intervals.
 
-    Raises:
-        IdentificationError: no plateau at all, fewer than two speeds, or a speed held in one direction only.
+    ``IdentificationError`` for no plateau at all, fewer than two speeds, or a speed held in one direction only.
     """
     shape = np.shape(time_s)
     for name, column in (("position", position_rad), ("torque", torque_nm), ("command", command_rad)):

@@ -79,10 +79,8 @@ class _Fitted:
 def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: str = "") -> Presliding:
     """Stiffness of the joint before it slides, and the friction at which it does, with their 95 % intervals.
 
-    Columns, shape (n,), hold several slow reversals, each a few times longer than the presliding travel.
-
-    Raises:
-        IdentificationError: fewer than two reversals, or no passage from one sliding level to the other in them.
+    Columns, shape (n,), hold several slow reversals, each a few times longer than the presliding travel. Fewer than
+    two, or no passage from one sliding level to the other in them, is an ``IdentificationError``.
     """
     step_s = float(np.median(np.diff(time_s)))
     smooth = uniform_filter1d(np.asarray(position_rad, dtype=np.float64), max(1, round(_SMOOTHING_S / step_s)))

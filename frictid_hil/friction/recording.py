@@ -117,10 +117,8 @@ def synchronised(recording: CycleRecording, extra_torque_delay_s: float = 0.0) -
     """Zero-phase velocity and acceleration from the position, torque brought to the instants of the position.
 
     Only the declared skew is used (and what may be added to it, to see what a wrong declaration would do); it is never
-    searched for in the data, where unmodelled ripple would drag it by milliseconds.
-
-    Raises:
-        IdentificationError: shapes differ, time does not increase, or a value is not finite.
+    searched for in the data, where unmodelled ripple would drag it by milliseconds. ``IdentificationError`` for shapes
+    that differ, time that does not increase, and values that are not finite.
     """
     _check(recording)
     time, (position, torque) = uniform(recording.time_s, recording.position_rad, recording.torque_nm)
@@ -138,10 +136,9 @@ def synchronised(recording: CycleRecording, extra_torque_delay_s: float = 0.0) -
 
 
 def _without_lag(smoother: Gaussian, torque_nm: Array, advance_s: float, lag_s: float) -> Array:
-    """The smoothed torque as it was before a low-pass, y + lag dy/dt, then shifted by the rest of the delay.
+    """The smoothed torque before a low-pass, y + lag dy/dt, then shifted by the rest of the delay.
 
-    Shifted by all of it instead, a low-pass of 4 ms leaves 2 % of the curve at A = 5 deg: what it still remembers of
-    the turn reaches the windows.
+    Shifted by all of it, a low-pass of 4 ms leaves 2 % of the curve at A = 5 deg.
     """
     if not lag_s:
         return smoother.smooth(torque_nm, advance_s)

@@ -97,11 +97,7 @@ def fit(
     expected: tuple[float, ...] = (),
     doubtful: Array | None = None,  # columns of which the torque may hold more or less than was taken off, shape (n, m)
 ) -> Fit:
-    """Solve the model on every sample of the cycles that is not guarded.
-
-    Raises:
-        IdentificationError: too few samples remain, or the columns are linearly dependent.
-    """
+    """Solve it on every sample that is not guarded; ``IdentificationError``: too few, or columns that are dependent."""
     chosen = _choose(recording, motion, width_rad)
     observed = chosen.observed(motion, knots)
     columns, blocks = _columns(recording, motion, knots[observed], extra)
@@ -136,10 +132,7 @@ def fit(
 
 
 def _beats_nm(velocity: Array, rest: Array, knots: Array) -> float:
-    """What is left at each speed, both ways: quarters that err alike there do not tell by their scatter.
-
-    Speeds below the fast knots are left out: there knots are as dense as these bins.
-    """
+    """What is left at each fast knot's speed both ways, which the scatter of quarters that err alike does not tell."""
     speed = np.abs(velocity)
     number = np.floor(speed / knots[-1] * _SPEED_BINS).astype(np.int64)
     inside = (speed >= FAST_SHARE * knots[-1]) & (number < _SPEED_BINS)

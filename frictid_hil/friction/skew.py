@@ -120,8 +120,7 @@ class TimeSkew:
 def measured_skew(shaken: CycleRecording, link: Link | None = None) -> Delay:
     """The delay that the shaking shows, with the link of a soft joint as its cycles show it.
 
-    Raises:
-        IdentificationError: the stretch is cut short, does not shake, or shakes the link more than the joint.
+    ``IdentificationError``: the stretch is cut short, does not shake, or shakes the link more than the joint.
     """
     delay_s = 0.0
     for _ in range(_ROUNDS):

@@ -31,11 +31,7 @@ class Index:
         self._told = told
 
     def values(self, kind: str, names: Sequence[str], read: Callable[[str], Any]) -> dict[str, Any]:
-        """The value of every name, in their order; what the index lacks is read, and kept for next time.
-
-        Raises:
-            What ``read`` raises.
-        """
+        """Of every name, in their order; what is not kept is read, and kept. Raises as ``read`` does."""
         if not names:
             return {}
         try:

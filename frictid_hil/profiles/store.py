@@ -129,11 +129,7 @@ class ProfileStore:
             return self._noted(folder, "baseline", self.path(robot, identity), by, reason)
 
     def rollback(self, robot: str, *, by: str = "", reason: str = "") -> Promotion:
-        """Make the profile active again that was so before the present one; again for the one before that.
-
-        Raises:
-            UsageError: there is none before.
-        """
+        """Make the profile active again that was so before the present one; ``UsageError`` where there is none."""
         with self._locked(robot) as folder:
             stack = records.active_stack(self.promotions(robot))
             if len(stack) < 2:

@@ -123,8 +123,7 @@ def _cells(line: str, separator: str) -> list[str]:
 class CsvTable:
     """A CSV file with a header; a ``Table``. Blank lines and lines that begin with ``#`` are passed over.
 
-    Raises:
-        InputFileError: unreadable, no header, or a header that cannot be used.
+    A file that is unreadable, or has no header that can be used, is an ``InputFileError``.
     """
 
     def __init__(self, path: Path) -> None:

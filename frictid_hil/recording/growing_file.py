@@ -71,11 +71,7 @@ class GrowingLog:
         self._file = GrowingFile(path)
 
     def flush(self) -> None:
-        """Write what was taken and have it on the disk before returning.
-
-        Raises:
-            FrictidError: disk full; what was flushed before is kept and readable.
-        """
+        """Have what was taken on the disk; ``FrictidError`` where that is full: what was flushed is kept."""
         self._write_taken()
         self._file.sync()
 

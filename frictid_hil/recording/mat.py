@@ -57,10 +57,8 @@ class SpoiltMatFile(ValueError):
 def read_numbers(data: bytes) -> dict[str, Array]:
     """All real numeric variables of a whole file by name, of the type in which they stand there.
 
-    Arrays have two or more dimensions; fields of a struct of one element are ``struct.field``.
-
-    Raises:
-        SpoiltMatFile: not such a file, or cut off, or spoilt.
+    Arrays have two or more dimensions; fields of a struct of one element are ``struct.field``. What is no such file,
+    cut off or spoilt, is a ``SpoiltMatFile``.
     """
     if len(data) < HEADER_SIZE or data[126:128] not in (b"IM", b"MI"):
         raise SpoiltMatFile("no MATLAB 5 header")

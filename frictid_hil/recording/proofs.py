@@ -40,11 +40,7 @@ _BLOCK, _BLOCKS = 2000, 10
 
 
 def doubts_of(samples: Samples, *, where: str = "") -> tuple[str, ...]:
-    """What looks odd in a recording of one joint.
-
-    Raises:
-        InputFileError: velocity and position contradict each other by a factor that a unit explains.
-    """
+    """What looks odd; ``InputFileError`` where a unit explains by what factor velocity and position differ."""
     parts = _parts(samples)
     return (*_of_velocity(samples, parts, where), *_of_motion(samples), *_of_torque(samples, parts))
 

@@ -63,8 +63,7 @@ def read(path: str | Path, columns: ColumnMap | None = None, joint: str | None =
 def open_table(path: Path, topic: str | None = None) -> Table:
     """The named columns of a file, folder or data set of other tools; ``topic`` is of a ROS bag that has several.
 
-    Raises:
-        InputFileError: unreadable, or of an unknown kind.
+    What is unreadable, or of an unknown kind, is an ``InputFileError``.
     """
     name = path.name.lower()
     if not path.exists() and not name.endswith(LOG_SUFFIXES):

@@ -41,10 +41,8 @@ def is_bag(path: Path) -> bool:
 def open_bag(path: Path, topic: str | None = None) -> ArrayTable:
     """The joint states in a bag: folder of rosbag2, ``.mcap``, ``.db3`` beside its metadata, or ``.bag``.
 
-    ``topic`` says which where several hold joint states.
-
-    Raises:
-        InputFileError: unreadable, no such messages, several topics of them, or rosbags is not installed.
+    ``topic`` says which where several hold joint states. ``InputFileError``: unreadable, no such messages, several
+    topics of them, or rosbags is not installed.
     """
     files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
     for file in files:

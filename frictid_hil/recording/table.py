@@ -63,8 +63,7 @@ def mapped(
 ) -> list[Samples]:
     """The joints of a foreign file, or the only one wanted; ``open_table`` opens a companion file.
 
-    Raises:
-        InputFileError: a column is missing or cannot be used; a companion file does not fit; no such joint.
+    ``InputFileError``: a column is missing or cannot be used; a companion file does not fit; no such joint.
     """
     path = table.path
     joints = expanded(columns, table)
@@ -94,8 +93,7 @@ def mapped(
 def expanded(columns: ColumnMap, table: Table) -> dict[str, JointColumns]:
     """The joints of a map; an entry ``{joint}`` stands for every joint whose position the file has.
 
-    Raises:
-        InputFileError: no column is of the form that the map says.
+    No column of the form that the map says is an ``InputFileError``.
     """
     found = {name: known for name, known in columns.joints.items() if JOINT not in name}
     for pattern, known in columns.joints.items():
@@ -142,13 +140,10 @@ def samples_of(
     prismatic: bool,
     meta: Mapping[str, object],
 ) -> Samples:
-    """Samples from columns in SI units, after every check a reader owes its user.
+    """Samples from columns in SI units by the names of ``Samples``, shape (n,) each, after every check of a reader.
 
-    The table names the place of a bad value. Times are in units of ``unit_ns`` nanoseconds, columns by the names of
-    ``Samples``, shape (n,) each.
-
-    Raises:
-        InputFileError: a blank, NaN or infinite value, or time that does not increase, with column and line.
+    Times are in units of ``unit_ns`` nanoseconds. ``InputFileError`` for a value that is not finite, or time that does
+    not increase, with column and line (which the table tells).
     """
     for name, column in {"time": time, **columns}.items():
         bad = np.flatnonzero(~np.isfinite(column))

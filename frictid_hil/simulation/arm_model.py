@@ -39,8 +39,7 @@ class ArmModel:
     def from_mapping(mapping: Mapping[str, Any], rows: Mapping[str, Mapping[str, float]]) -> ArmModel:
         """The arm of ``simulated_arm`` and its joints' ``dh``, by name in the order of the chain; empty for none.
 
-        Raises:
-            InvalidFields: every unknown key, missing or impossible value, with its path.
+        Every unknown key, missing or impossible value is told by an ``InvalidFields``, with its path.
         """
         top = Fields(mapping)
         gravity = _triple(top, "gravity_m_s2", STANDARD_GRAVITY)

@@ -44,10 +44,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
-    """The compiled functions of ``plant.py``, effects included; see there for their arguments.
-
-    The last eight are pieces of ``run``, for another integrator to call.
-    """
+    """The compiled functions of ``plant.py``, effects included; the last eight are pieces for another integrator."""
 
     run: Callable[..., None]
     run_coupled: Callable[..., None]

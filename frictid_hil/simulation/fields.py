@@ -86,11 +86,7 @@ class Fields:
                 self.problem(str(key), f"is unknown; known keys are {known or 'none'}")
 
     def finish(self) -> None:
-        """Raise everything found.
-
-        Raises:
-            InvalidFields: at least one problem.
-        """
+        """Raise everything found as an ``InvalidFields``."""
         if self.problems:
             raise InvalidFields(self.problems)
 

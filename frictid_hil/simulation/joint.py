@@ -163,11 +163,7 @@ class JointModel:
 
     @staticmethod
     def of(joint: Simulated, name: str) -> JointModel:
-        """The simulated joint of a robot file, or as a driver knows it.
-
-        Raises:
-            InvalidFields: what is wrong with it, by ``joints.NAME.simulated.KEY``.
-        """
+        """Of a robot file, or as a driver knows it; ``InvalidFields`` by ``joints.NAME.simulated.KEY``."""
         try:
             return JointModel.from_mapping(
                 joint.simulated,
@@ -200,11 +196,7 @@ class JointModel:
         return mapping
 
     def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> JointModel:
-        """The same joint with these effects instead of its own.
-
-        Raises:
-            InvalidFields: an unknown effect or parameter, or a value out of bounds.
-        """
+        """The same with these effects alone; ``InvalidFields`` for what is unknown or out of bounds."""
         fields = Fields(effects, ("effects",))
         complete = _read_effects(fields)
         fields.finish()

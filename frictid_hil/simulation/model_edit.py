@@ -27,12 +27,9 @@ _ANGLES = ("ref", "springyield", "springref", "range")  # attributes of a hinge 
 
 
 def edited_files(robot: RobotModel, natives: Mapping[str, Native], out: Path) -> dict[Path, bytes]:
-    """What to write so that ``out`` is the user's model with these changes of joints, by path.
+    """What to write so that ``out`` (which may be the user's own file) is the user's model with these joints, by path.
 
-    The user's own file is edited in place.
-
-    Raises:
-        InputFileError: a joint does not stand in the file by its name.
+    A joint that does not stand in the file by its name is an ``InputFileError``.
     """
     text = ModelText(robot.path)
     degrees = not robot.urdf and _in_degrees(text)
@@ -45,11 +42,7 @@ def edited_files(robot: RobotModel, natives: Mapping[str, Native], out: Path) ->
 
 
 def compiled_with(robot: RobotModel, natives: Mapping[str, Native]) -> mujoco.MjModel:
-    """MuJoCo's model of the edited file, which is staged in a folder that is gone afterwards.
-
-    Raises:
-        FrictidError: MuJoCo cannot read what the changes make of the file; it stays as it is.
-    """
+    """MuJoCo's model of the edited file; ``FrictidError`` where it cannot be read, and nothing is written."""
     with tempfile.TemporaryDirectory(prefix="frictid-model-") as folder:
         out = Path(folder) / "model.xml"
         for path, content in edited_files(robot, natives, out).items():

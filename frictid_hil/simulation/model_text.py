@@ -43,11 +43,7 @@ class XmlFile:
 
     @staticmethod
     def read(path: Path) -> XmlFile:
-        """Parse a file.
-
-        Raises:
-            InputFileError: unreadable, or no XML.
-        """
+        """Parse a file; ``InputFileError`` where it is unreadable, or no XML."""
         try:
             file = XmlFile(path, path.read_bytes())
             _parse(file)
@@ -100,11 +96,7 @@ def _end_of_tag(content: bytes, start: int) -> int:
 
 
 class ModelText:
-    """The files of a model.
-
-    Raises:
-        InputFileError: one of them cannot be read.
-    """
+    """The files of a model; ``InputFileError`` where one of them cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self.main = XmlFile.read(path)
@@ -121,11 +113,7 @@ class ModelText:
                     yield from self._all(self.files[path])
 
     def joint(self, name: str) -> Element:
-        """The element of a joint.
-
-        Raises:
-            InputFileError: it does not stand in the files by this name.
-        """
+        """The element of a joint; ``InputFileError`` where it does not stand in the files by this name."""
         for element in self._elements:
             inside = element.parent.tag if element.parent is not None else ""
             if element.tag == "joint" and element.attributes.get("name") == name and inside not in _NOT_JOINTS:

@@ -283,10 +283,9 @@ def _with_ramps(speed: Array, torque: Array, fastest: float) -> tuple[float, lis
 def _write_ramps(
     native: Native, joint: str, ramps: Sequence[tuple[float, float]], dry: float, yields_rad: float
 ) -> None:
-    """Dampers that push instead of holding back, each up to its limit, and one that holds them while the spring bends.
+    """Dampers that push, each up to its limit, and one that holds them while the spring bends, lest the joint hum.
 
-    Friction that falls as soon as the joint moves would let it hum at rest. LuGre's element of next to no level damps
-    along its own travel alone, so that nothing of it is left when the joint slides.
+    LuGre's element of next to no level damps along its own travel alone: nothing of it is left in sliding.
     """
     for number, (knee, fall) in enumerate(ramps, 1):
         native.more_actuators.append(
@@ -430,8 +429,7 @@ def limits_of_gap(
 ) -> str:
     """Limits on either side of a gap that yield like spring and damper, corrected for a step where one is given.
 
-    With an impedance near 0 a limit's force depends on its depth and speed alone, as stiffness and damping over the
-    inertia that it sees.
+    At an impedance near 0 their force depends on depth and speed alone, per inertia that they see.
     """
     reduced = 1.0 / (1.0 / max(motor_kg_m2, 1e-9) + 1.0 / max(link_kg_m2, 1e-9))
     stiff, damped = stiffness / reduced, max(damping, 1e-9) / reduced
@@ -445,8 +443,7 @@ def limits_of_gap(
 def _at_step(stiffness: float, damping: float, step_s: float) -> float:
     """Stiffness with which a limit, whose force MuJoCo takes from the start of each step, swings as the contact does.
 
-    Both per inertia. The poles of x'' = -k x - d x' by steps of the velocity first, then of the position, are those of
-    the contact itself, exp(s h).
+    Per inertia, as the damping: the poles of the discrete x'' = -k x - d x' are those of the contact, exp(s h).
     """
     decay = math.exp(-damping * step_s)
     turn = cmath.cos(cmath.sqrt(stiffness - 0.25 * damping**2) * step_s).real

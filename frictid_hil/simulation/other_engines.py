@@ -79,10 +79,7 @@ def in_newton(
     """Torque of the drives of a stage's joints along commands, in Newton's MuJoCo solver, (n, k).
 
     Every joint of the stage has a position drive; ``joints`` are names of k prims. The solver's step is ``step_s`` at
-    most; time has the shape (n,), the start (k,), commands (n, k).
-
-    Raises:
-        Exception: whatever Newton raises of a stage that it cannot read.
+    most; time has the shape (n,), the start (k,), commands (n, k). Raises what Newton raises of a stage.
     """
     engine = importlib.import_module("newton")
     importlib.import_module("warp").config.quiet = True

@@ -112,11 +112,9 @@ def open_loop(
     state: CarryOver | None = None,
     start_rad: float = 0.0,
 ) -> Simulated:
-    """The joint driven by the recorded torque; nothing pulls it back, so it drifts from the recording.
+    """The joint driven by the reported torque, at even times, (n,); it drifts. The rest is as for ``closed_loop``.
 
     Effects between command and current (delay, lag, limit) have already shaped a reported torque and are left out.
-
-    The torque is as reported, at even steps of time, shapes (n,); the rest is as for ``closed_loop``.
     """
     time = np.asarray(time_s, dtype=np.float64)
     period_s = float((time[-1] - time[0]) / max(1, time.size - 1))

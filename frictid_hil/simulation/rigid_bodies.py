@@ -22,11 +22,7 @@ Vector = NDArray[np.float64]
 
 
 class RigidBodies:
-    """The links of an arm.
-
-    Raises:
-        ConfigError: the library is not installed.
-    """
+    """The links of an arm; raises as ``mujoco_library``."""
 
     def __init__(self, model: ArmModel) -> None:
         mujoco = mujoco_library()
@@ -49,11 +45,7 @@ class RigidBodies:
 
 
 def mujoco_library() -> mujoco:
-    """The package ``mujoco``.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
+    """The package ``mujoco``; ``ConfigError`` where it is not installed."""
     try:
         import mujoco
     except ImportError:

@@ -117,11 +117,7 @@ class RobotModel:
         return tuple(name for name in self._number if name)
 
     def number(self, joint: str) -> int:
-        """Place of a joint in MuJoCo's tables.
-
-        Raises:
-            UsageError: the file has no such joint.
-        """
+        """Place of a joint in MuJoCo's tables; ``UsageError`` where the file has no such joint."""
         if joint not in self._number:
             raise UsageError(
                 f"no joint is called {joint!r}", where=str(self.path), next_step=f"it has {', '.join(self.joints)}"
@@ -211,11 +207,7 @@ class RobotModel:
         )
 
     def posture(self, held: Mapping[str, float]) -> Array:
-        """Positions of everything, (nq,): the file's reference, with some joints elsewhere.
-
-        Raises:
-            UsageError: the file has no such joint.
-        """
+        """Positions of everything, (nq,): the file's reference, with some joints elsewhere; raises as ``number``."""
         qpos: Array = self.compiled.qpos0.copy()
         for name, value in held.items():
             qpos[int(self.compiled.jnt_qposadr[self.number(name)])] = value
@@ -321,8 +313,7 @@ def inverse_torque(
 def relax(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Let springs that yield begin without force where the joints stand.
 
-    MuJoCo keeps how far such a spring has slipped in ``data.plastic``. Where positions are set by hand and that is not,
-    the first step feels the whole stretch: thousands of N m.
+    MuJoCo keeps their slip in ``data.plastic``; where it is not set with the positions, the first step feels thousands.
     """
     plastic = getattr(data, "plastic", None)
     if plastic is None or plastic.size == 0:
@@ -338,11 +329,7 @@ def relax(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def is_urdf(path: Path) -> bool:
-    """Whether a file is a URDF: by its root element, whatever its name.
-
-    Raises:
-        InputFileError: it cannot be read, or is no XML.
-    """
+    """Whether a file is a URDF, by its root element; ``InputFileError`` where it cannot be read, or is no XML."""
     try:
         for _, element in ElementTree.iterparse(path, events=("start",)):
             if element.tag not in ("robot", "mujoco", "mujocoinclude"):

@@ -146,8 +146,7 @@ def c_compiler() -> str | None:
 def run_c(header: str, velocity_rad_s: Mapping[str, Array], step_s: float) -> dict[str, Array]:
     """Friction of the header's step function along velocities at even steps, by joint, N m, (n,).
 
-    Raises:
-        FrictidError: there is no compiler, or the header does not compile or run.
+    ``FrictidError``: there is no compiler, or the header does not compile or run.
     """
     compiler = c_compiler()
     if compiler is None:

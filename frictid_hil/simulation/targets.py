@@ -342,10 +342,8 @@ def written_as(
 ) -> dict[str, str]:
     """Text by file name, for the physics step of the user's model; samples of the posterior may be empty.
 
-    BAM has a file for each joint, ``NAME_JOINT.json``; the text for ``newton`` is made by ``usd``.
-
-    Raises:
-        UsageError: no such target.
+    BAM has a file for each joint, ``NAME_JOINT.json``; the text for ``newton`` is made by ``usd``. ``UsageError`` for a
+    target that is none.
     """
     stem, dot, ending = file.rpartition(".")
     makers: dict[str, Callable[[], dict[str, str]]] = {

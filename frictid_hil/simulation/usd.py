@@ -81,8 +81,7 @@ def joint_prims(stage: Path, joints: Sequence[str]) -> dict[str, tuple[str, bool
 def stage(robot: RobotModel, joints: Mapping[str, Numbers]) -> str:
     """A whole stage: links with their masses, and joints; no shapes, as they are no part of what was identified.
 
-    Raises:
-        UsageError: a body has several joints, or one that is neither hinge nor slide.
+    ``UsageError`` for a body of several joints, or of one that is neither hinge nor slide.
     """
     library, m = mujoco_library(), robot.compiled
     data = library.MjData(m)
