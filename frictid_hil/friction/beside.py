@@ -5,10 +5,9 @@ curve; a recording shows them all the same. The least-squares model is solved ag
 
     sgn(v) phi(|v|) t, sgn(v) phi(|v|) x, sgn(v) phi(|v|) (3 x^2 - 1) / 2, sgn(v) I a, sgn(v) |I a|
 
-x running from -1 to 1 along the travel, with a prior on each: over a short travel they are so alike, and on a light
-joint so small, that data alone would say anything. The curve stays as it is. What a column makes of a window's mean,
-or of a knot of the model that lacks it, times what was found of it, is the error that it explains; what the covariance
-leaves open is the error that it may yet hide. Time, the first, only stands beside: ``intervals.Drift`` tells of it.
+x running from -1 to 1 along the travel, with a prior on each, as data alone would say anything. The curve stays as it
+is: what a column makes of a window's mean or a knot, times what was found of it, is the error that it explains; what
+the covariance leaves open is the error that it may yet hide. Of time, the first, ``intervals.Drift`` tells.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
 """A recording brought to one instant and freed of what is no friction of its joint, before any curve is drawn.
 
-Timing comes first, for everything else is read through it: declared, or measured where the joint shook for it. Then
-what other joints took that moved along, or what the link of a soft joint took; then how well the timing fits.
-
-Before all of it, torque that a missed set-point shook is taken from beside it: a drive that misses one brakes to a
-stand, and jumps after the path with all the torque it has. At 250 Hz three samples of that in one window bent a curve
-by 6 %, with every gate passed.
+First, torque that a missed set-point shook is taken from beside it: a drive that misses one brakes to a stand, and
+jumps after the path with all the torque it has (three samples of that in one window bent a curve by 6 %). Then timing,
+declared or measured; then what other joints took that moved along, or the link of a soft joint.
 """
 
 from __future__ import annotations

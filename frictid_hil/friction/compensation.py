@@ -1,23 +1,15 @@
 """Friction compensation, algorithm (24) and its rivals (26), (27): one tiny stateful object per joint.
 
-A spring of stiffness K that slips at the Coulomb level F_0 stands for presliding and the sign of motion; the identified
-curve adds what depends on speed; R < 1 keeps the joint from running away. The spring is driven by encoder increments
-rather than by v * dt: a coarse or late velocity costs nothing there (20).
-
 ==========  ===================================================
 ``mo``      R K e                                           (26)
 ``mol``     R (K e + B_c v)                                 (27)
 ``mop``     R (K e + phi_0(v))                              (24)
 ==========  ===================================================
 
-The paper's spring yields at once: K e rises with the slope K until it slips at F_0. Gears with many small contacts
-yield gradually: after a turning point friction turns over twice as steeply at first, and ever less (Dahl 1968, LuGre).
-Where a slow reversal shows that, the spring of our setting does the same, d(K e)/dx = K (1 -/+ K e / F_0); its slope at
-rest is K as before.
-
-Two limits keep it stable. R < 1: a free joint that is given all of its friction back runs away on the first touch.
-R K < presliding stiffness: below break-away the joint is held by its own presliding spring alone; a compensation
-stiffer than that is a negative spring, and the joint hunts.
+A spring of stiffness K that slips at F_0 stands for presliding and the sign of motion. Encoder increments drive it, not
+v * dt: a coarse or late velocity costs nothing there (20). It yields at once or, where a slow reversal shows that,
+gradually, d(K e)/dx = K (1 -/+ K e / F_0) (Dahl 1968, LuGre). R < 1, or a free joint runs away on the first touch; R K
+< presliding stiffness, or a standing one hunts (docs/reference/compensation-law.md).
 """
 
 from __future__ import annotations
@@ -51,14 +43,8 @@ def stiffness_with_margin(
 ) -> float:
     """K of the setting ``ours``: the largest for which R K < presliding stiffness holds with both margins.
 
-    Presliding is a spring that yields after a travel x = level / stiffness. Both are identified from a joint that
-    creeps, under static friction. A joint that begins to hunt slides: its friction falls to F_0 while x stays, and so
-    its stiffness falls to F_0 / x. That is what R K has to stay below.
-
-    Delay asks for no margin: near rest the joint obeys I q'' + sigma q = R K q(t - T), and to first order in T this is
-    I q'' + R K T q' + (sigma - R K) q = 0: torque that helps, given late, damps.
-
-    Of the two figures of presliding, the low end of the stiffness's interval and the high end of the level's.
+    docs/reference/compensation-law.md derives it. Of the two figures of presliding, the low end of the stiffness's
+    interval and the high end of the level's.
     """
     sliding_nm_per_rad = presliding_nm_per_rad * min(1.0, coulomb_nm / presliding_level_nm)
     return sliding_nm_per_rad / ((1.0 + STIFFNESS_MARGIN) * (ratio + RATIO_MARGIN))

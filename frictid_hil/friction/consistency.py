@@ -1,14 +1,11 @@
 """Do the columns of a recording agree with each other? Gates against data that are wrong and look right.
 
-A torque that comes late, is cut off, or changes its scale in the middle gives a smooth curve with narrow intervals.
-What gives it away is another column, another stretch of the run, or what was expected of the joint. What cannot be seen
-in principle: a torque that is wrong by the same factor from the first sample to the last (it is another joint's), and
-a delay of position and torque alike.
+A torque that comes late, is cut off, or changes its scale in the middle gives a smooth curve with narrow intervals;
+another column, another stretch of the run, or what was expected of the joint gives it away. Not to be seen are a factor
+from the first sample to the last, and a delay of position and torque alike.
 
-Through a sine, a torque that is late looks like a joint of less inertia and of more friction at high speeds, and no fit
-can tell them apart. At a turning point it can be told: friction goes from one sliding level to the other over a short
-travel that is the same at every speed (20), so that a fast joint needs less time for it than a slow one. Lateness comes
-on top of that time.
+Through a sine, a late torque looks like less inertia and more friction at high speeds. At a turning point it can be
+told: friction turns over along a travel that is the same at every speed (20), which takes a fast joint less time.
 """
 
 from __future__ import annotations

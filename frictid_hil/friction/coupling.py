@@ -1,18 +1,13 @@
 """Joints that move together drive each other: how much, from a stretch in which each of them also shakes on its own.
 
 In phase, what joint j's acceleration asks of joint i, M_ij a_j, is the same both ways and leaves the half-difference of
-the two directions alone - as long as both joints follow their commands alike. A servo that lags by 0.1 ms more than its
-neighbour's is enough to leave M_ij w^2 v dt in the curve: as with time skew, it grows with the speed cubed.
+the two directions alone, as long as no servo lags by 0.1 ms more than its neighbour. In the cycles themselves M cannot
+be told, but in the *coupling* stretch each joint shakes at a frequency of its own: least squares on the other joints'
+accelerations gives one row of M per joint, a symmetric matrix is the mean of its two triangles weighed by what is known
+of each, and M_ij a_j, a_j as measured, is taken off the torque of the cycles.
 
-In the cycles themselves every joint's acceleration is that of every other one, so that M cannot be told from them. In
-the *coupling* stretch each joint shakes at a frequency of its own on top of a slow common cycle: least squares on the
-other joints' accelerations gives one row of M per joint, a symmetric matrix is the mean of its two triangles weighed by
-what is known of each, and M_ij a_j, a_j as measured, is taken off the torque of the cycles.
-
-Gravity is the same both ways only at the same positions, and the two windows of a cycle do not cover quite the same.
-Of an arm that moves as a whole more weight turns than of a joint alone, so that what is left of it shows: gravity as
-the least-squares model finds it, posture beside it, is taken off before the windows are averaged. The posture's own
-columns (inertia that changes along the travel, velocity products) are known too poorly one by one to do the same.
+Of an arm that moves as a whole so much weight turns that what the two windows of a cycle do not cover alike shows:
+gravity as the least-squares model finds it, posture beside it, is taken off before the windows are averaged.
 """
 
 from __future__ import annotations

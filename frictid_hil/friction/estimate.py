@@ -1,14 +1,9 @@
 """One interface to all estimators: a recording in, a curve with intervals, rigid body, ripple and diagnostics out.
 
-================  =====================================================================================
-``function-a``    the published algorithm on the drive's own velocity and torque, untouched
-``aligned``       the same windows on zero-phase velocity and torque brought to the instants of the position
-``least-squares`` one linear model of the whole recording
-================  =====================================================================================
-
-Where the recording shows a link swinging on a soft joint, the last two leave its torque out.
-
-The published result always stands beside the chosen one.
+``function-a`` is the published algorithm on the drive's own velocity and torque, untouched, and always stands beside
+the chosen one; ``aligned`` has the same windows on zero-phase velocity and torque brought to the instants of the
+position; ``least-squares`` is one linear model of the whole recording. Where a link swings, the last two leave its
+torque out.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """Zero-phase smoothing, differentiation and fractional delay by one family of kernels.
 
-A Gaussian is a low-pass without phase, its derivatives differentiate what it smooths, and shifting its centre delays
-by any fraction of a sample. A Gaussian of at least one sample's width is band-limited to 3e-9, so the shift is exact at
-every fraction; linear interpolation smooths most at half a sample and would draw a search for a delay there.
-
-The same kernel on both sides of a linear model leaves the model's coefficients as they are.
+A Gaussian is a low-pass without phase, its derivatives differentiate what it smooths, and shifting its centre delays by
+any fraction of a sample, exactly if it is at least one sample wide; linear interpolation smooths most at half a sample
+and would draw a search for a delay there. On both sides of a linear model it leaves the coefficients as they are.
 """
 
 from __future__ import annotations

@@ -1,14 +1,10 @@
 """Function A (7): from the samples of N cycles to N velocity-force pairs, exactly as published.
 
 Cycle n contributes the samples near its velocity peaks, abs(v) >= c n V / N, forwards and backwards. Half the
-difference of the two mean torques is F_n: inertia and gravity act alike in both windows and cancel (10)-(14).
-
-Errata of the paper that this file answers:
-
-* (5) I = T_{N+1} / dt is not an integer: windows are half-open in the *recorded* time, not in sample numbers.
-* (7f) averages positive velocities only. V_n keeps that meaning; the mean speed backwards is reported beside it.
-* (11)-(13) flip the sign of the velocity and swap (13a) with (13b); the conclusion (14) holds, and (7i) follows it.
-* an empty window has no average: it is an error that names the cycle and the direction, never NaN.
+difference of the two mean torques is F_n: inertia and gravity act alike in both windows and cancel (10)-(14). V_n is
+the mean of the positive velocities, (7f); the mean speed backwards is reported beside it. docs/reference/procedure.md
+lists the errata: windows are half-open in the *recorded* time, and an empty one is an error that names cycle and
+direction.
 """
 
 from __future__ import annotations

@@ -1,19 +1,14 @@
 """Honest 95 % intervals: how far an identified torque may be from the truth, by terms that can be named.
 
-* **scatter**: the two halves of the travel, forwards and backwards, are four looks at one F_n; torque noise and ripple
-  show as their disagreement. What comes again in every cycle is no chance, and their mean has none of it;
-* **skew**: what the data leave open of the declared uncertainty of the delay between torque and position (``skew``),
-  through the very same windows;
-* **model**: the distance between windows and global least squares, two estimators that fail differently, beyond the
-  scatter of both;
-* **drift**: friction changed between the first and the second run of the repeated cycle, at the same speed;
-* **beside**: friction that varies along the travel or grows with the load, which neither contains (``beside``);
-* **link**: the swinging of a soft joint's link, or the pull of joints that moved along, taken off the torque, is known
-  only so well.
+- **scatter**: the two halves of the travel, forwards and backwards, are four looks at one F_n that disagree;
+- **skew**: what the data leave open of the declared delay between torque and position, through the very same windows;
+- **model**: the distance between windows and global least squares beyond the scatter of both;
+- **drift**: friction changed between the first and the second run of the repeated cycle, at the same speed;
+- **beside**: friction that varies along the travel or grows with the load, which neither contains (``beside``);
+- **link**: what was taken off the torque, of a link that swings or joints that moved along, is known only so well.
 
-For least squares, scatter comes from the misfit of every quarter cycle as a whole (``clustered``: misfit that lasts a
-pass is counted once, not per sample), and the model term from the bend that a line cannot follow and, where the torque
-swings between set-points, from what every pass has alike at one speed (``Fit.beats_nm``).
+For least squares, scatter comes from the misfit of every quarter cycle as a whole (``clustered``), and the model term
+from the bend that a line cannot follow and, where the torque swings between set-points, from ``Fit.beats_nm``.
 """
 
 from __future__ import annotations

@@ -1,15 +1,13 @@
 """A link on a spring behind the gear: how it swings, and the torque that takes.
 
-Seen from the motor, a soft joint's inertia is two: torque = J_m a_m + J_l a_l + friction, where the link follows the
-motor through a spring,
+Seen from the motor, a soft joint's inertia is two: torque = J_m a_m + J_l a_l + friction, where
 
     a_l / a_m = (1 + 2 z s / w) / (1 + 2 z s / w + s^2 / w^2)
 
-w being the link's own frequency with the motor held, z its damping. The windows of (7) make the mean of a_m zero, but
-not that of a_l: each join of two cycles is a jump of acceleration that leaves the link ringing. So w, z and J_l are
-looked for in what the least-squares model leaves, and J_l (a_l - a_m), computed from the measured position, is taken
-off the torque. a_l / a_m - 1 begins with s^2, a delay with s: a column for the delay stands beside the link's, so that
-the search cannot take one for the other. What that column finds is thrown away; only declared timing counts.
+w being the link's own frequency with the motor held, z its damping. Each join of two cycles is a jump of acceleration
+that leaves the link ringing, so that the windows of (7) do not make the mean of a_l zero. So w, z and J_l are looked
+for in what the least-squares model leaves, and J_l (a_l - a_m), computed from the measured position, is taken off the
+torque. A column for a delay stands beside, lest the search take one for the link; what it finds is thrown away.
 """
 
 from __future__ import annotations

@@ -1,12 +1,10 @@
 """Pairs from plateaus of constant speed, for recordings that move by trapezoids or triangles instead of sine cycles.
 
-The windows of (7) are replaced by stretches in which the commanded (or else the measured) speed does not change; equal
-speeds are gathered, both ways, and (7f)-(7i) are applied to each. At constant speed the inertia term is zero by itself;
-gravity cancels between the two directions when they cover the same travel.
+The windows of (7) are replaced by stretches of one commanded (or else measured) speed; equal speeds are gathered, both
+ways. There is no inertia in them; gravity cancels between the directions if they cover the same travel.
 
-The intervals come from how much alike torques disagree: halves of plateaus at other places of the travel (friction and
-gravity that depend on the place) and the same place passed again (noise, friction that changes with time). Both are
-pooled over all speeds, for a speed that is held at one place only says nothing of the others.
+The intervals come from how much alike torques disagree, at other places of the travel and at the same place passed
+again, pooled over all speeds: one that is held at one place only says nothing of the others.
 """
 
 from __future__ import annotations

@@ -1,16 +1,13 @@
 """Presliding stiffness from a slow small reversal: how steeply torque turns over before the joint slides again.
 
-After a turning point friction goes from one sliding level to the other over a short travel, (20): a spring until it
-yields. Two shapes of that passage are fitted, x being the travel since the turning point, D the whole change of torque,
+After a turning point friction goes from one sliding level to the other over a short travel, (20). Two shapes of that
+passage are fitted, x being the travel since the turning point, D the whole change of torque,
 
     yields at once       f(x) = f_r -/+ min(sigma x, D)
     yields gradually     f(x) = f_r -/+ D (1 - exp(-2 sigma x / D))        (Dahl, LuGre)
 
 and the one that leaves less decides; a joint is only called gradual where that is plain. sigma is the slope midway,
-where friction passes zero: the stiffness of a joint at rest. Right after the turning point a gradual joint is twice as
-stiff, but only until it has moved; a compensation spring that stays as stiff as that would give back more than the
-joint takes. D / 2 is the friction of a joint that creeps, static friction included: the level at which the spring of a
-joint at rest yields.
+where friction passes zero: the stiffness of a joint at rest. D / 2 is the friction of a joint that creeps.
 
 Where no reversal shows the passage, the turning points of the cycles bound it. A position loop that is proportional
 alone is a spring, too, with damping: torque = k (command - position) - d velocity + constant. A wrong scale of the

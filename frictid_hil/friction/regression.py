@@ -2,10 +2,9 @@
 
     torque = I a + g_c cos q + g_s sin q + bias + sgn(v) sum_k F_k h_k(|v|) + sum_k E_k h_k(|v|) + ripple(q, v)
 
-h_k are hat functions over the speed, so that F_k is the odd part of the friction at knot k and E_k the even part
-(direction asymmetry). E is zero at v = 0: a constant cannot be told from the bias and is counted there. Every column,
-the torque included, goes through the same zero-phase kernel, which therefore changes no coefficient. The first
-milliradians after each reversal are left out, where friction is still a spring.
+h_k are hat functions over the speed: F_k is the odd part of the friction at knot k, E_k the even part (direction
+asymmetry), zero at v = 0, where it cannot be told from the bias. All columns pass one zero-phase kernel, which changes
+no coefficient. The first milliradians after each reversal are left out, where friction is still a spring.
 """
 
 from __future__ import annotations

@@ -2,22 +2,16 @@
 
 A torque that comes dt later than declared turns inertia's share, I a, by w dt towards the velocity: of a shaking of
 frequency w and speed v it leaves I w^2 v dt, where friction leaves (d phi / d v) v. So the joint shakes at two
-frequencies **at the same speed**: what grows with w^2 is delay, what stays is friction. The slow motion is never
-reversed by the shaking, so that the level of the friction, gravity and bias do not enter; presliding does not, for the
-first milliradians after each turn are left out. Ripple of the torque depends on the place: each shaking runs a second
-time in antiphase, and meets the other half of it.
+frequencies **at the same speed**, and the slow motion never reverses: the level of the friction, gravity and bias do
+not enter. Each shaking runs a second time in antiphase, to meet the other half of the ripple.
 
-Least squares over the whole stretch finds I from the acceleration and -I dt from its rate, beside friction of both
-directions, what depends on the place and on the load, and ripple of every whole order up to six. The torque is then
-moved by what was found and solved again, until nothing remains. A link on a spring adds I_l 2 z w^4 / w_l^3: what the
-cycles showed of it is taken off, and what they left open of it is counted.
+Least squares over the whole stretch finds I from the acceleration and -I dt from its rate. The torque is moved by what
+was found and solved again, until nothing remains. A link on a spring adds I_l 2 z w^4 / w_l^3: what the cycles showed
+of it is taken off, and what they left open of it is counted.
 
-The cycles themselves cannot tell as much: there frequency rises with speed, so that delay and friction differ only in
-what happens between the peaks, where ripple is as large. Whole sines of one speed and unlike travel, the other choice,
-reverse: the level of the friction enters, and 0.3 % of it is 0.4 ms at 20 deg. Still, ``seen_delay`` asks them: the
-least-squares model with one more column, the torque's own rate, shows what delay the data would ask for. Effects that
-the model lacks drag that figure by milliseconds, so that it corrects nothing. But where it lies near zero, a wrong
-declaration can hardly hide: what the declaration leaves open then shrinks to the delay seen and its own uncertainty.
+The cycles themselves cannot tell as much: there frequency rises with speed. Still, ``seen_delay`` asks them by one more
+column, the torque's own rate. Effects that the model lacks drag that figure by milliseconds, so that it corrects
+nothing; but where it lies near zero, what the declaration leaves open shrinks to it and its own uncertainty.
 """
 
 from __future__ import annotations
