@@ -22,10 +22,7 @@ _ROOM_FOR_BARS = 100  # columns of a terminal; on a narrower one the torque is a
 
 
 def figures_of(rows: Rows, max_torque_nm: float | None) -> dict[str, str]:
-    """What is told of some rows of one joint: largest error and torque, newest temperature; "" where not measured.
-
-    There is no bar of the torque where its limit is None.
-    """
+    """What rows of one joint tell: largest error, torque (a bar with its limit), newest temperature; or ""."""
     error_rad = _largest(rows["position_command_rad"] - rows["position_rad"])
     torque_nm = _largest(rows["torque_nm"])
     temperature_c = float(rows["temperature_c"][-1])
@@ -53,10 +50,7 @@ class Lateness:
         self.late = 0
 
     def take(self, t_ns: np.ndarray[tuple[int], np.dtype[np.int64]]) -> int:
-        """Late cycles so far: rows more than a period and a half after the one before.
-
-        The times are those of one joint's rows since the last call, shape ``(n,)``.
-        """
+        """Late cycles so far: rows, with these times since the last call, over 1.5 periods after the one before."""
         if self._newest_ns is not None:
             t_ns = np.concatenate([[self._newest_ns], t_ns])
         self.late += int(np.count_nonzero(np.diff(t_ns) > self._most_ns))
@@ -69,18 +63,14 @@ class Lateness:
 
 
 class JointView:
-    """The rows of one run.
-
-    Stretches are named by their joint, or joints that move together. The period of a cycle is infinite where the
-    controller cycles by itself and sends its recording afterwards.
-    """
+    """The rows of one run, by joint."""
 
     def __init__(
         self,
         console: Console,
         setup: RobotSetup,
-        period_s: float,
-        planned: Mapping[str, float],
+        period_s: float,  # of a cycle; infinite where a controller cycles by itself and sends its recording afterwards
+        planned: Mapping[str, float],  # s, by stretch: the name of its joint, or of joints that move together
         members: Mapping[str, Sequence[str]],
     ) -> None:
         self._setup = setup

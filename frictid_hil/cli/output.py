@@ -70,14 +70,11 @@ class Told(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """How this call was asked to speak, and every other option and argument that it was given, by name.
-
-    The command of ``notify`` is given the JSON on its standard input, whatever the ending.
-    """
+    """How this call was asked to speak, and what else it was asked."""
 
     as_json: bool = False
     quiet: bool = False
-    given: Mapping[str, Any] = field(default_factory=dict)
+    given: Mapping[str, Any] = field(default_factory=dict)  # every other option and argument, by name
 
     def options(self, kind: Callable[..., Asked], **more: Any) -> Asked:
         """The value that a job takes: what was given under the names of its fields, and ``more``; else its defaults."""
@@ -241,10 +238,7 @@ def takes(**own: Any) -> Callable[[Verb], Verb]:
 def verb(
     app: typer.Typer, name: str, show: Callable[[Output, Result], None] | None = None, schema: str = ""
 ) -> Callable[[Verb], Verb]:
-    """Make a verb of a function that is given an ``Output`` and the verb's own options, and returns its result.
-
-    ``show`` prints the result for a person; the JSON's schema is named after the verb unless told.
-    """
+    """Make a verb of a function of ``Output`` and its own options; ``show`` prints its result for a person."""
 
     def add(function: Verb) -> Verb:
         _, *taken = inspect.signature(function, eval_str=True).parameters.values()

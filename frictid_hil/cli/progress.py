@@ -70,11 +70,7 @@ def _range_deg(low_rad: float, high_rad: float) -> str:
 
 
 def answer(question: str) -> bool:
-    """A person's yes or no, typed after the question was shown: what was typed before answers nothing.
-
-    Raises:
-        Interrupted: Ctrl-C, Ctrl-D or SIGTERM; while asking, these mean what they say to every other program.
-    """
+    """A person's yes or no; what was typed before it was shown is none (``Interrupted``: Ctrl-C, Ctrl-D, SIGTERM)."""
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt

@@ -110,11 +110,7 @@ _QUANTITY_OF = {re.sub("_(rad|rad_s|nm)$", "", quantity): quantity for quantity 
 
 
 def load_columns(name: str | Path) -> ColumnMap:
-    """Read and check a column map: a path, or one that is shipped or lies in a ``columns`` folder of the search path.
-
-    Raises:
-        ConfigError: not found, or wrong; every problem with file:line:column.
-    """
+    """Read and check a column map: a path, or one on the search path (``ConfigError``: all problems, their places)."""
     document = read(find(name, folder="columns", what="column map"))
     schema_version(document, KIND, NEWEST)
     file = validated(document, ColumnsFile)

@@ -223,11 +223,7 @@ class NominalSet:
 
 
 def load_nominal(path: Path, *, logs: bool = True) -> NominalSet:
-    """Read and check a ``nominal.yaml``, or that of a folder; it must list experiments unless ``logs`` says otherwise.
-
-    Raises:
-        ConfigError: unreadable or wrong, every problem with file:line:column.
-    """
+    """Read and check a ``nominal.yaml``, or that of a folder (``ConfigError``: every problem with its place)."""
     if path.is_dir():
         path = path / "nominal.yaml"
         if not path.exists():

@@ -74,10 +74,7 @@ class Estimate(Strict):
     @model_validator(mode="before")
     @classmethod
     def _no_finer_than_wide(cls, given: Any) -> Any:
-        """The interval's ends to a hundredth of its width; rounding again changes nothing.
-
-        The value keeps its digits: gravity and bias are known far better together than each of them alone.
-        """
+        """Ends to a hundredth of the width. The value keeps its digits: gravity and bias are better known together."""
         ends: list[Any] = [given.get("low"), given.get("high")] if isinstance(given, dict) else []
         before: list[Any] = []
         while (
@@ -476,11 +473,7 @@ def profile_file(given: Path) -> Path:
 
 
 def load_profile(path: str | Path) -> FrictionProfile:
-    """Read and check a profile.
-
-    Raises:
-        ConfigError: unreadable, wrong (every problem with file:line:column), of another schema or a newer version.
-    """
+    """Read and check a profile (``ConfigError``: unreadable, all problems, their places, another or a newer schema)."""
     return profile_from(read(Path(path)))
 
 

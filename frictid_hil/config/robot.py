@@ -228,12 +228,7 @@ class Robot:
         return hashlib.sha256(canonical.encode()).hexdigest()
 
     def driver(self, bus: str | None = None) -> str:
-        """The driver for a bus, ``interface:channel``: the file's own, unless it is of a kind that needs another.
-
-        Raises:
-            UsageError: no ``interface:`` in ``bus``, or no driver of this robot for such a bus.
-            ConfigError: no such driver.
-        """
+        """The driver for a bus: the file's own, unless that needs another (``UsageError``: it has none)."""
         own = self.file.driver
         if bus is None or interface_of(bus) == interface_of(self.file.bus):
             return own
@@ -263,15 +258,9 @@ class Robot:
         velocity_rad_s: float | None = None,
         cycles: int | None = None,
         ratio: float | None = None,
-        shares: tuple[float, ...] = (),
+        shares: tuple[float, ...] = (),  # peak speeds of a short programme as shares of V; their number is then N
     ) -> Procedure:
-        """The procedure of one joint: what is given here, else the joint's own, else the robot's.
-
-        ``shares`` are the peak speeds of a short programme as shares of V; their number is then N.
-
-        Raises:
-            UsageError: no such joint, or values that make no procedure.
-        """
+        """What is given, else the joint's own, else the robot's (``UsageError``: no such joint, or no procedure)."""
         self.check_joints([joint])
         own, common = self.file.joints[joint].procedure, self.file.procedure
         asked = {"amplitude_rad": amplitude_rad, "velocity_rad_s": velocity_rad_s, "ratio": ratio}
@@ -293,13 +282,7 @@ class Robot:
                 )
 
     def to_setup(self, bus: str | None = None, *, realtime: bool = False, seed: int = 0) -> RobotSetup:
-        """The robot as a driver needs to know it, on another bus than the file's own where one is given.
-
-        ``realtime`` is the wall clock even where lock-step is possible, ``seed`` that of simulated noise.
-
-        Raises:
-            ConfigError: a joint has no address of the kind that the driver of this bus needs.
-        """
+        """The robot as a driver knows it, on the file's bus unless told (``ConfigError``: a joint without address)."""
         driver, kind = self.driver(bus), self.kind(bus)
         gates = {**kind.gates, **self.file.gates.model_dump(exclude_none=True)}
         key, (lowest, highest) = kind.addressed_by, kind.addresses
@@ -343,11 +326,7 @@ class Robot:
 
 
 def load_robot(name: str | Path) -> Robot:
-    """Read and check a robot file: a path, or a name on the search path (``hp3j.yaml``, ``hp3j``).
-
-    Raises:
-        ConfigError: not found, or wrong; the message lists every problem with file:line:column.
-    """
+    """Read and check a robot file: a path, or a name (``hp3j``) to search for (``ConfigError``: all problems)."""
     path = find(name)
     document = in_si(_extended(path, ()))
     file = validated(document, RobotFile)
@@ -358,11 +337,7 @@ def load_robot(name: str | Path) -> Robot:
 
 
 def interface_of(bus: str) -> str:
-    """The interface part of ``interface:channel``.
-
-    Raises:
-        UsageError, which is also fit for a validator: no interface or no channel.
-    """
+    """The interface part of ``interface:channel`` (``BusSyntaxError``, fit for a validator too: it has none)."""
     interface, colon, channel = bus.partition(":")
     if not (interface and colon and channel):
         raise BusSyntaxError(f"expected interface:channel (socketcan:can0, serial:/dev/ttyUSB0), found {bus!r}")

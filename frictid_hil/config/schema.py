@@ -45,11 +45,7 @@ Names = Annotated[tuple[str, ...], BeforeValidator(as_tuple)]
 
 
 def schema_version(document: Document, kind: str, newest: int) -> int:
-    """The major version a document declares by ``schema: <kind>/<major>``.
-
-    Raises:
-        ConfigError: no schema, one of another kind, or a newer major than this program knows.
-    """
+    """The major of ``schema: <kind>/<major>`` (``ConfigError``: no schema, of another kind, or newer than we know)."""
     declared = document.root.content.get("schema")
     expected = f"{kind}/{newest}"
     if declared is None:
@@ -75,13 +71,7 @@ def schema_version(document: Document, kind: str, newest: int) -> int:
 
 
 def validated(document: Document, model: type[Model], data: Mapping[str, Any] | None = None) -> Model:
-    """The document, which gives the places for errors, as a model.
-
-    ``data`` are its values where they were changed (migrated, renamed) since reading.
-
-    Raises:
-        ConfigError: every field that is wrong, with file:line:column.
-    """
+    """The document, or ``data`` made of its values, as a model (``ConfigError``: all wrong fields, their places)."""
     try:
         return model.model_validate(document.data if data is None else data)
     except ValidationError as invalid:
@@ -172,10 +162,7 @@ def _unit_hint(path: KeyPath, value: Any) -> str:
 
 
 def in_si(document: Document) -> Document:
-    """The same document with every ``150deg`` or ``115deg/s`` as the number in the unit that ends its key.
-
-    Text that is no such quantity stays, for ``validated`` to complain of.
-    """
+    """The document with every ``150deg`` or ``115deg/s`` in the unit that ends its key; other text stays."""
 
     def converted(node: Node, key: str) -> Node:
         if isinstance(node.content, dict):

@@ -38,17 +38,11 @@ def places(folder: str = "") -> list[Path]:
 
 
 def find(name: str | Path, *, folder: str = "", what: str = "robot file", beside: Path | None = None) -> Path:
-    """The file a person means by ``name``, with or without its suffix: a path, or a bare name to search for.
-
-    The folder ``beside`` (that of the file which mentions ``name``) is tried before all others; ``what`` is how errors
-    call it.
-
-    Raises:
-        ConfigError: not found; the message lists the places searched and the nearest names there are.
-    """
+    """The file a person means: a path or a bare name, suffix or not (``ConfigError``: where it was searched)."""
     if not str(name):
         raise ConfigError(f"no {what} named")
     literal = Path(name).expanduser()
+    # Beside the file that mentions it comes first.
     candidates = [literal] if beside is None else [beside / literal, literal]
     if len(literal.parts) == 1:
         candidates += [place / literal for place in places(folder)]

@@ -42,11 +42,7 @@ _Writer.add_representer(Row, _represent_dict)
 
 
 def dump(values: Mapping[str, Any]) -> str:
-    """The values as YAML text; reading it back gives the same values, floats bit for bit.
-
-    Raises:
-        ValueError: a number that is not finite, or a value that is no mapping, list, text, number, truth or None.
-    """
+    """The values as YAML text, floats bit for bit (``ValueError``: not finite, or of no plain kind)."""
     style: dict[str, Any] = {"sort_keys": False, "allow_unicode": True, "width": 120, "default_flow_style": False}
     return str(yaml.dump(plain(values), Dumper=_Writer, **style))
 

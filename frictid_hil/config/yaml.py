@@ -95,10 +95,7 @@ class Document:
         return node.key_place if of_key or found != path else node.place
 
     def error(self, problems: Iterable[FieldProblem], *, at_key: Collection[KeyPath] = ()) -> ConfigError:
-        """All problems, with paths from the root, one a line in the order of the file, each with its place.
-
-        Of paths ``at_key`` the key is at fault rather than the value.
-        """
+        """Problems, one a line in the order of the file, each with its place, or with its key's (``at_key``)."""
         placed = [(self.place(p.path, of_key=p.path in at_key), p) for p in problems]
         placed.sort(key=lambda one: (one[0].path.name, one[0].line, one[0].column))
         lines = [
@@ -118,11 +115,7 @@ class Document:
 
 
 def read(path: Path) -> Document:
-    """Read one YAML file.
-
-    Raises:
-        ConfigError: the file cannot be read, is not UTF-8, is not YAML, repeats a key, or is not a mapping.
-    """
+    """Read one YAML file (``ConfigError``: unreadable, not UTF-8, not YAML, a key twice, or not a mapping)."""
     return parse(_text(path), path)
 
 

@@ -12,10 +12,7 @@ _NEWEST = 100
 
 
 def home_page(robots: Mapping[str, str], runs: Sequence[tuple[str, Mapping[str, Any]]]) -> Page:
-    """Robots of the store and runs on the disk, newest first.
-
-    Of a robot it is told when its newest profile was measured (UTC); "" where no night gave one yet.
-    """
+    """Robots, each with when its newest profile was measured (UTC, "" for never), and runs, newest first."""
     moving = [address for address, manifest in runs if manifest["outcome"] is None]
     headline = f"{_count(len(robots), 'robot')}, {_count(len(runs), 'run')}; {len(moving)} at work or cut off."
     robot_rows = tuple(

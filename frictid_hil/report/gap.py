@@ -32,10 +32,7 @@ class SideBySide:
 
 
 def gap_page(found: Diagnosis, side_by_side: tuple[SideBySide, ...] = (), profiles: tuple[Profile, ...] = ()) -> Page:
-    """The page of one diagnosis.
-
-    Logs are those of the validation; profiles show the missing torque over what it may depend on.
-    """
+    """The page of one diagnosis: validation logs side by side, missing torque over what it may depend on."""
     pictures = (_where_figure(found), *(_profile(p) for p in profiles)) if found.where else ()
     sections = [
         Section("Where the gap lies", tables=(_where_table(found),), figures=pictures),

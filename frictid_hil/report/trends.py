@@ -18,10 +18,7 @@ _MOST_POINTS = 1500
 def trend_figures(
     trends: Mapping[str, Sequence[TrendPoint]], *, drift_limit_percent: float | None = None
 ) -> tuple[Figure, ...]:
-    """F_0, distance from the baseline, temperature of every joint, oldest first; what has no value at all is left out.
-
-    The policy's limit of drift is drawn beside the distance.
-    """
+    """F_0, distance from the baseline (beside its limit), temperature of every joint, oldest first; no empty ones."""
     figures = (
         _figure(
             trends,

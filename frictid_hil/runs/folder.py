@@ -62,13 +62,9 @@ class RunFolder:
 
     @staticmethod
     def create(robot: Robot, verb: str, options: Mapping[str, Any], out: Path | None = None) -> RunFolder:
-        """A new folder, ``runs/<robot>/<UTC>-<verb>`` unless told; it may hold other things, but nothing of a run.
+        """A new folder, that may hold other things, and nothing of a run.
 
-        A run is continued with its options, plain values.
-
-        Raises:
-            UsageError: ``out`` holds a run, or a file that a run would write.
-            FrictidError: no permission, or no space; nothing is left behind.
+        ``UsageError``: it holds a run, or a file of one. ``FrictidError``: no permission, no space; nothing is left.
         """
         manifest: dict[str, Any] = {
             "schema": SCHEMA,
@@ -98,26 +94,16 @@ class RunFolder:
 
     @staticmethod
     def resume(path: Path, robot: Robot) -> RunFolder:
-        """A folder of an earlier run, to be continued; nothing in it changes until ``begin``.
-
-        Raises:
-            UsageError: not a run folder, or of another configuration.
-            HardwareBusy: the run is at work.
-        """
+        """A folder to go on with, as it is until ``begin`` (``UsageError``: none, or of another configuration)."""
         folder = RunFolder(path, manifest_of(path, robot))
         folder._hold()
         return folder
 
     # -- while it runs ------------------------------------------------------------------------------------------
 
+    # Joints in the order of the driver; ``seen`` is given the rows, once they are kept.
     def add_part(self, joints: list[str], seen: Callable[[Rows], None]) -> RowKeeper:
-        """New files for samples and frames, beside those of earlier parts, joints in the order of the driver.
-
-        ``seen`` is given the rows, once they are kept.
-
-        Raises:
-            FrictidError: they cannot be created, or the folder cannot take a result; only what is new was removed.
-        """
+        """New files beside earlier parts (``FrictidError``: they cannot be made; the folder is as it was)."""
         self._part = max((number for _, number in parts_of(self.path)), default=0) + 1
         suffix = "" if self._part == 1 else f"-{self._part}"
         samples, frames = self.path / f"samples{suffix}.mcap", self.path / f"bus{suffix}.blf"

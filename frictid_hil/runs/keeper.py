@@ -19,13 +19,7 @@ _FLUSH_S = 0.25
 
 
 class RowKeeper:
-    """Writes rows as they come and remembers them for the identification.
-
-    The files are new or empty, joints in the order of the driver; ``seen`` is given the rows, once they are kept.
-
-    Raises:
-        FrictidError: a file cannot be opened; the other one is closed again.
-    """
+    """Writes rows as they come, into new files, and remembers them; ``seen`` gets them then (``FrictidError``)."""
 
     def __init__(
         self, samples: Path, frames: Path, joints: list[str], meta: Mapping[str, Any], seen: Callable[[Rows], None]
@@ -64,10 +58,7 @@ class RowKeeper:
             self._samples.metadata(f"joint/{joint}", identity)
 
     def taken(self, joint: str, start_ns: int, end_ns: int) -> Rows:
-        """Return the rows of one joint in a stretch of run time, and forget everything older than its start.
-
-        Joints that moved together are taken one after the other from the same stretch.
-        """
+        """One joint's rows in a stretch of run time; what is older is forgotten, others of the same stretch are not."""
         every = np.concatenate(self._kept) if self._kept else np.empty(0, SAMPLE_ROW)
         self._kept = [every[every["t_ns"] >= start_ns]]
         index = self._joints.index(joint)

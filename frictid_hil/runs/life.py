@@ -150,13 +150,9 @@ class Run:
         prepare: Callable[[Driver], None] | None = None,  # see ``run_plan``
         care: Care | None = None,  # bounds
     ) -> FrictidError | None:
-        """Show a plan within every limit, open the files, read the hardware, ask, and move.
+        """Show a plan within every limit, open files, read the hardware, ask, and move; returns what ended it early.
 
-        Raises:
-            FrictidError: refused, unreachable or interrupted before anything could move; nothing of it is left.
-
-        Returns:
-            What ended it early; None where the plan was done.
+        ``FrictidError``: before anything could move; nothing of it is left.
         """
         before = self._in(State.PLANNED, State.MEASURING)
         order = self._order

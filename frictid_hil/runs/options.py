@@ -44,11 +44,7 @@ def kept_options(options: Options) -> dict[str, Any]:
 
 
 def restored(options: Asked, verbs: Collection[str]) -> Asked:
-    """The options that a run of these verbs began with; those of ``options`` itself where nothing is continued.
-
-    Raises:
-        UsageError: no run of these verbs, no robot, or an option that differs from that of the run.
-    """
+    """The options that a run of these verbs began with, if there is one (``UsageError``: no robot, or others now)."""
     run = options.resume
     if run is None:
         if not options.robot:

@@ -57,11 +57,9 @@ class Rehearsals:
         )
 
     def heed(self, event: Event, plan: Plan) -> None:
-        """Keep what a finished run rehearsed. Refuse an exchanged drive if its joint is not going to rehearse.
+        """Keep what a finished run rehearsed; refuse, and forget, an exchanged drive that is not going to rehearse.
 
-        Raises:
-            UsageError: a drive was exchanged; what its joint rehearsed is forgotten: the next run rehearses.
-            FrictidError: what was rehearsed cannot be written.
+        ``UsageError``: exchanged. ``FrictidError``: what was rehearsed cannot be written.
         """
         if self._simulated:
             return

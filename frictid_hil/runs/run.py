@@ -43,13 +43,9 @@ def run_plan(
     # clock with a twin of the driver, since the one that runs is in another process.
     prepare: Callable[[Driver], None] | None = None,
 ) -> int:
-    """Run a plan, checked against limits, to its end.
+    """Run a plan, checked against limits, to its end; returns how many rows were lost by writing too slowly (or 0).
 
-    Returns:
-        Rows that were lost because files were written too slowly (0 in a healthy run).
-
-    Raises:
-        FrictidError: see ``Scheduler.run``; what was measured has been given to the keeper by then.
+    Raises as ``Scheduler.run``; what was measured has been given to the keeper by then.
     """
     care = care or Care()
     driver = new_driver(driver_name, setup)
