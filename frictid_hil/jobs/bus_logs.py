@@ -55,13 +55,7 @@ def is_log(source: Path) -> bool:
 
 
 def given_map(frames: Path | None, eds: Path | None, robot: Robot) -> Mapping[str, Any] | None:
-    """The frame map that a person gave, None where none was.
-
-    Raises:
-        UsageError: two were given.
-        ConfigError: the mapping file is wrong, every problem with its place.
-        InputFileError: the EDS file is unreadable, or maps no position.
-    """
+    """The frame map that a person gave, or None (``UsageError``: two; ``ConfigError``, ``InputFileError``: wrong)."""
     if frames is not None and eds is not None:
         raise UsageError("--frames and --eds both say which frame is what; give one")
     if eds is not None:
@@ -78,13 +72,7 @@ def given_map(frames: Path | None, eds: Path | None, robot: Robot) -> Mapping[st
 
 
 def logs_of(source: Path, given: Mapping[str, Any] | None) -> list[Log]:
-    """The bus logs of a run folder, or the one file, each with its frame map.
-
-    A frame map that a person gave goes before the manifest's.
-
-    Raises:
-        UsageError: nothing says which frame carries what.
-    """
+    """Each bus log of a run folder, or the one file; a given map goes first (``UsageError``: there is no map)."""
     folder = source if source.is_dir() else source.parent
     manifest = load_manifest(folder) if (folder / "manifest.json").exists() else None
     logs = []
@@ -190,16 +178,10 @@ def ordered(frames: Frames) -> tuple[Frames, int]:
 def rows_by_joint(
     frames: Iterable[LoggedFrame],
     frame_map: Mapping[str, Any],
-    account: Account,
-    at: Callable[[int], None] = lambda _: None,
+    account: Account,  # counts are added to it
+    at: Callable[[int], None] = lambda _: None,  # told the run time of rows as they come, ns
 ) -> dict[str, Rows]:
-    """Every report of every joint as rows of ``ring.SAMPLE_ROW``, as the cyclic loop would have kept them.
-
-    ``at`` is told the run time of rows as they come, in ns; counts are added to ``account``.
-
-    Raises:
-        InvalidFields: nobody understands this map, or a field of it is wrong.
-    """
+    """Every report as a row of ``ring.SAMPLE_ROW``, as kept live, by joint (``InvalidFields``: a wrong frame map)."""
     names = joint_names(frame_map)
     kept: list[list[tuple[Any, ...]]] = [[] for _ in names]
     decoder = frame_decoders(str(frame_map.get("schema"))).decoder(frame_map)
@@ -253,23 +235,16 @@ def _filled(column: NDArray[np.floating[Any]] | None) -> NDArray[np.floating[Any
 
 
 def samples_in(
-    logs: Sequence[Log],
+    logs: Sequence[Log],  # of one run
     robot: str,
-    account: Account,
+    account: Account,  # counts are added to it
     *,
-    joints: Collection[str] = (),
+    joints: Collection[str] = (),  # all when empty
     paced: bool = False,
-    echo: can.BusABC | None = None,
-    at: Callable[[float], None] = lambda _: None,
+    echo: can.BusABC | None = None,  # every frame is sent again there
+    at: Callable[[float], None] = lambda _: None,  # told the time since the start of a log, s, as rows come
 ) -> dict[str, Samples]:
-    """The samples of every joint that moved during the logs of one run, by joint; of the last one in which it did.
-
-    Only ``joints``, or all when empty. Counts are added to ``account``; every frame is sent again on ``echo``; ``at``
-    is told the time since the start of a log, s, as rows come.
-
-    Raises:
-        InputFileError: a log is unreadable, or no report could be decoded.
-    """
+    """Samples of the joints that moved, each of the last log in which it did (``InputFileError``: of none)."""
     newest: dict[str, Samples] = {}
     for log in logs:
         frames = read_frames(log.path)

@@ -50,10 +50,7 @@ _CONTINUED = (VERB, "recalibrate")
 
 @dataclass(frozen=True, slots=True)
 class CalibrateOptions:
-    """What a person asked for; what is left at its default is the robot file's own, or that of the run continued.
-
-    The options are those of ``frictid-hil calibrate --help``, and for other verbs:
-    """
+    """What a person asked for, see ``calibrate --help``; the rest is the robot file's, or of the run continued."""
 
     robot: str = ""
     bus: str | None = None
@@ -80,16 +77,13 @@ class CalibrateOptions:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A calibration that was checked and not yet begun.
-
-    The plan is without joints where the run continued has measured all; ``kept`` are those that it has finished.
-    """
+    """A calibration that was checked and not yet begun."""
 
     order: Order
-    plan: Plan
+    plan: Plan  # without joints where the run continued has measured all
     method: str
     options: CalibrateOptions
-    kept: Mapping[str, tuple[JointProfile, dict[str, Any]]]
+    kept: Mapping[str, tuple[JointProfile, dict[str, Any]]]  # joints that the run continued has finished
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,11 +107,7 @@ class Calibrated:
 
 
 def plan_calibration(options: CalibrateOptions) -> Planned:
-    """Read the robot file and plan; opens no bus and writes nothing.
-
-    Raises:
-        UsageError: refused (arguments, files, limits, options other than those of the run continued).
-    """
+    """Read the robot file and plan; opens no bus, writes nothing (``UsageError``: files, limits, other options)."""
     if options.resume and options.out and options.out.resolve() != options.resume.resolve():
         raise UsageError("--out and --resume both name a folder", next_step="leave --out out: a run stays in its own")
     options = restored(options, _CONTINUED)
@@ -176,13 +166,8 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
 def calibrate(options: CalibrateOptions, watcher: Watcher) -> Calibrated:
     """Calibrate a robot: plan, check, ask, run, identify and write.
 
-    Raises:
-        UsageError: refused before anything moved (arguments, files, limits, the person said no).
-        HardwareError: hardware unreachable.
-
-    Returns:
-        Its ending and the joints. A refusal, a safety abort or an interruption after motion began is an ending, not an
-        exception: what was measured until then is in the run folder and in the result.
+    ``UsageError``, ``HardwareError``: before anything moved. Later an error is an ending: what was measured until then
+    is in the run folder and in the result.
     """
     planned = plan_calibration(options)
     with Run(planned.order, watcher) as run:

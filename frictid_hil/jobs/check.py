@@ -18,14 +18,9 @@ from frictid_hil.runner.realtime import Latency, measure_latency
 
 
 def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0, dry: bool = False) -> dict[str, Any]:
-    """Read the hardware, and compare it with the robot file and with the standard plan.
+    """Read the hardware and compare it with robot file and plan; ``dry`` looks at these two alone and opens no bus.
 
-    This computer's punctuality is measured for ``latency_s``. With ``dry`` the robot file, all it refers to and the
-    plan are checked alone; the bus is not opened.
-
-    Raises:
-        HardwareError: the bus or a drive cannot be reached at all.
-        ConfigError: the robot file is wrong.
+    ``HardwareError``: the bus or a drive cannot be reached at all. ``ConfigError``: the robot file is wrong.
     """
     robot = load_robot(robot_name)
     setup = robot.to_setup(bus)

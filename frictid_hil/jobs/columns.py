@@ -16,16 +16,9 @@ from frictid_hil.recording.samples import Samples
 
 
 def columns(log: Path, *, columns: str | None = None, out: Path | None = None, force: bool = False) -> dict[str, Any]:
-    """Show what a log holds, column by column.
+    """Show what a log holds; the map ``columns`` is tried on it, or one is drafted, into ``out``.
 
-    The map ``columns`` is tried on it, or one is drafted, into ``out``.
-
-    Raises:
-        InputFileError: the log cannot be read, or no column is like a position.
-        UsageError: ``out`` exists.
-
-    Returns:
-        ``columns`` of the file, ``joints`` as they are read now, ``findings``, and ``map`` (text) where one is drafted.
+    ``InputFileError``: unreadable, or no column is like a position. ``UsageError``: ``out`` exists.
     """
     known = load_columns(columns) if columns else None
     run = log.is_dir() and any(log.glob("samples*.mcap"))

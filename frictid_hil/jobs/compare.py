@@ -22,14 +22,7 @@ _TRUTH_POINTS = 4000
 
 
 def compare(profile_path: Path, other_path: Path | None, truth: str | None) -> dict[str, Any]:
-    """Compute how far apart the curves are, for every joint that both sides have.
-
-    The reference is another profile, or ``truth``, a robot file with ``simulated`` joints; profiles may be run folders.
-
-    Raises:
-        UsageError: not exactly one reference.
-        ProfileMismatch: no joint in common.
-    """
+    """How far curves are apart, joint by joint (``UsageError``: not one reference; ``ProfileMismatch``: no joint)."""
     if (other_path is None) == (truth is None):
         raise UsageError(
             "compare needs one reference: a second profile, or --truth with a robot file",
@@ -75,11 +68,7 @@ def compare(profile_path: Path, other_path: Path | None, truth: str | None) -> d
 
 
 def true_curve(robot: Robot, name: str, velocity_rad_s: float) -> FrictionCurve:
-    """The odd part of a simulated joint's steady sliding friction, as a dense curve up to ``velocity_rad_s``.
-
-    Raises:
-        ConfigError: the robot file's ``simulated`` mapping is wrong; with its place.
-    """
+    """The odd part of a simulated joint's steady friction, up to a speed (``ConfigError``: a wrong ``simulated``)."""
     from frictid_hil.simulation.joint import JointModel  # loads numba; only truth needs it
 
     with robot.document.locating():

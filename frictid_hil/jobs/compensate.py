@@ -58,11 +58,7 @@ class CompensateOptions:
 
 
 def plan_compensation(options: CompensateOptions) -> Asked:
-    """Decide everything that can be decided before a bus is opened.
-
-    Raises:
-        UsageError: arguments, files, a profile that does not fit, limits.
-    """
+    """Decide all that can be before a bus is opened (``UsageError``: arguments, files, an unfit profile, limits)."""
     robot = load_robot(options.robot)
     robot.check_joints([options.joint])
     simulated = robot.kind(options.bus).simulated
@@ -91,16 +87,9 @@ def plan_compensation(options: CompensateOptions) -> Asked:
 
 
 def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None = None) -> CompensationResult:
-    """Compensate a joint in each mode that is asked for, and compare the modes.
+    """Compensate a joint in each mode that is asked for, and compare the modes; ``live`` is told figures of a service.
 
-    Raises:
-        UsageError: refused before anything moved (arguments, files, limits, another drive's profile, the person said
-            no).
-        HardwareError: hardware unreachable.
-
-    Returns:
-        Its ending and each mode's figures. A refusal by the probe, a safety abort or an interruption after motion began
-        is an ending, not an exception.
+    ``UsageError``, ``HardwareError``: before anything moved. Later an error, also a refusal by the probe, is an ending.
     """
     asked = plan_compensation(options)
     order = Order(VERB, asked.robot, asked.setup, options.bus, {"profile": str(asked.profile)}, options.out)

@@ -32,14 +32,7 @@ _LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
 def serve(runs: Path, store: ProfileStore, port: int, announce: Callable[[str], None]) -> None:
-    """Answer on loopback until Ctrl-C.
-
-    ``announce`` is given the address once it is known; runs are looked for under ``runs``.
-
-    Raises:
-        UsageError: starlette and uvicorn are not installed.
-        HardwareError: the port cannot be had.
-    """
+    """Answer on loopback, at an address that is announced, until Ctrl-C (``UsageError``, ``HardwareError``)."""
     try:
         import uvicorn
     except ImportError:

@@ -16,20 +16,12 @@ _GROUP = "frictid_hil.emulators"
 def emulate(
     kind: str,
     *,
-    announce: Callable[[str], None],
+    announce: Callable[[str], None],  # told the port or bus once it can be opened
     robot_name: str,
     bus: str | None = None,
-    **settings: object,
+    **settings: object,  # what else this emulator takes
 ) -> None:
-    """Serve until Ctrl-C or SIGTERM.
-
-    ``announce`` is told the port or bus once it can be opened; ``settings`` are what else this emulator takes.
-
-    Raises:
-        UsageError: no such emulator, or settings that it cannot take.
-        HardwareError: the bus cannot be opened.
-        ConfigError: the robot file is wrong.
-    """
+    """Serve until Ctrl-C or SIGTERM (``UsageError``: no such emulator; ``HardwareError``, ``ConfigError``)."""
     installed = {point.name: point for point in entry_points(group=_GROUP)}
     if kind not in installed:
         raise UsageError(f"no emulator named {kind!r}; installed: {', '.join(sorted(installed)) or 'none'}")

@@ -48,14 +48,7 @@ _LOG.addHandler(logging.NullHandler())
 
 
 class FoxgloveServer:
-    """Listens from the start; announces channels and sends messages from any thread, without waiting for viewers.
-
-    Attributes:
-        port: that it listens on.
-
-    Raises:
-        OSError: cannot listen there.
-    """
+    """Listens on its ``port`` from the start (``OSError``); sends from any thread, without waiting for viewers."""
 
     def __init__(self, name: str, host: str, port: int, refused: Callable[[str], None]) -> None:
         self._hello = {"op": "serverInfo", "name": name, "capabilities": [], "sessionId": str(time.time_ns())}

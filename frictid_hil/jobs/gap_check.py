@@ -28,17 +28,8 @@ def run_gap_check(
 ) -> dict[str, Any]:
     """Draw joints whose effect is sealed, diagnose them in processes of their own, open the seal, score.
 
-    See ``frictid-hil gap check --help``. Twenty cases bring every kind, 200 every effect five times. With ``force`` the
-    answers of an unfinished check are dropped; ``progress`` is given a line now and then.
-
-    Returns:
-        What ``--json`` prints of a single world: ``outcome``, ``world``, ``seed``, ``cases``, ``truth_sha256``,
-        ``rates`` (each ``rate``, ``low``, ``high``, ``right``, ``of``), ``scores`` (everything), ``leave_one_out`` (or
-        None), ``out``. Of several: ``outcome``, ``seed``, ``cases``, ``worlds`` (the same by name), ``out``.
-
-    Raises:
-        UsageError: no case asked for, no such world, or ``out`` holds a finished check, or answers of another one.
-            The same check, interrupted, goes on with its answers.
+    See ``gap check --help`` and the JSON of the verb. An interrupted check goes on with its answers. ``UsageError``: no
+    case, no such world, or ``out`` holds a finished check or, without ``force``, answers of another one.
     """
     if cases < 1:
         raise UsageError(f"{cases} cases cannot be scored", next_step="ask for at least 20: `gap check --cases 20`")
@@ -72,10 +63,7 @@ def run_gap_check(
 
 
 def _claim(folder: Path, asked: tuple[str, int, int], *, force: bool) -> None:
-    """Note in the folder which check it belongs to.
-
-    The note is a digest: seed and world are not to be read beside the cases.
-    """
+    """Note in the folder which check it belongs to, as a digest: seed and world are not to be read beside the cases."""
     digest = hashlib.sha256(json.dumps([*asked, code_digest()]).encode()).hexdigest()
     note, answers = folder / "check.sha256", folder / "answers.jsonl"
     same = note.exists() and note.read_text() == digest

@@ -37,15 +37,7 @@ from frictid_hil.simulation.joint import JointModel
 
 
 def draft(source: Source, out: Path, *, force: bool = False) -> dict[str, Any]:
-    """Write a first ``nominal.yaml`` from recordings.
-
-    Raises:
-        UsageError: ``out`` exists and ``force`` is not given.
-        InputFileError: an unusable recording.
-
-    Returns:
-        The JSON of the verb.
-    """
+    """Write a first ``nominal.yaml`` from recordings (``UsageError``: ``out`` exists; ``InputFileError``: unusable)."""
     refuse_overwriting([out], force=force)
     document = drafted(source.load())
     write_whole(out, dump(document))
@@ -62,18 +54,11 @@ def diagnose(
     force: bool = False,
     negligible: float | None = None,
 ) -> dict[str, Any]:
-    """Diagnose a set.
+    """Diagnose a set, or the folder of one; any verdict is a result, ``model_refused`` says why no model is written.
 
-    The options are those of the verb; a path stands for the folder of an experiment set. ``write_model`` becomes a
-    robot file, or a belief with effects where its loop cannot be simulated; ``negligible`` is over the friction level.
-
-    Raises:
-        InputFileError, ConfigError: the set is unusable.
-        UsageError: the page cannot be written, or a file is there already.
-
-    Returns:
-        The JSON of the verb. Any verdict is a result: where a model was asked for and none is written, ``model`` is
-        null and ``model_refused`` says why and what to do.
+    ``write_model`` becomes a robot file, or a belief with effects where its loop cannot be simulated; ``negligible`` is
+    over the friction level. ``InputFileError``, ``ConfigError``: unusable. ``UsageError``: a file is there, or no page
+    can be.
     """
     callback = None if mujoco is None else mujoco.with_suffix(".py")
     refuse_overwriting([write_model, mujoco, callback, None if out is None else out / "gap.html"], force=force)
@@ -138,10 +123,7 @@ _OPEN = (
 
 
 def _improved(experiments: ExperimentSet, found: Diagnosis, apply: bool) -> dict[str, Any] | None:
-    """The file to write: a robot where its loop can be simulated, else a belief with effects; None where it is open.
-
-    Where no friction was believed, its draft is an improvement whatever the verdict.
-    """
+    """A robot, or a belief where no loop can be simulated; None while it is open, unless no friction was believed."""
     nothing_believed = experiments.nominal.curve is None and any(
         e.torque_nm is not None for e in experiments.experiments
     )
@@ -173,10 +155,7 @@ _STANDARD_CYCLE_HZ = 1000.0
 
 
 def _robot(experiments: ExperimentSet, model: JointModel) -> dict[str, Any]:
-    """A robot of one simulated joint.
-
-    Limits come from the recordings: the joint may go where it was seen to go, a little further, and as fast.
-    """
+    """A robot of one simulated joint, with limits from where and how fast it was seen to go, and a little further."""
     document: Mapping[str, Any] = experiments.nominal.document or {}
     low = min(float(log.position_rad.min()) for log in experiments.experiments)
     high = max(float(log.position_rad.max()) for log in experiments.experiments)
@@ -217,11 +196,7 @@ def _robot(experiments: ExperimentSet, model: JointModel) -> dict[str, Any]:
 
 
 def _belief(experiments: ExperimentSet, effects: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
-    """A ``nominal.yaml`` with what was found, where the joint's loop cannot be simulated and so makes no robot.
-
-    Inertia, gravity and friction are drafted where nothing was believed of friction. ``effects`` are those of a robot
-    file's ``simulated``.
-    """
+    """A ``nominal.yaml`` with what was found, for a joint that makes no robot; drafted if no friction was believed."""
     document = {k: v for k, v in (experiments.nominal.document or {}).items() if k != "experiments"}
     fitted = tuple(log for log in experiments.experiments if not log.validation) or experiments.experiments
     if experiments.nominal.curve is None and any(log.torque_nm is not None for log in fitted):
@@ -252,19 +227,11 @@ def diagnose_arm(
     force: bool = False,
     executor_name: str | None = None,
 ) -> dict[str, Any]:
-    """Diagnose the joints of a model.
+    """Diagnose every joint of a model, and what belongs to no single one; ``wanted`` are files for other simulators.
 
-    The options are those of the verb; ``wanted`` are files for other simulators.
-
-    Raises:
-        InputFileError, ConfigError: model, logs or map are unusable.
-        UsageError: a joint that is not there, or a file that is there already.
-
-    Returns:
-        The JSON of the verb: ``joints`` by name, each as the diagnosis of a set, with ``believed``, ``drafted`` and
-        ``asked``; ``held``, ``still``, ``logs``, ``summary`` and ``arm`` (causes of no single joint); ``closed_loop``
-        of the user's model before and after in MuJoCo, with what was ``left_out`` as it came no nearer; ``export`` of a
-        model that was written; ``report`` of the arm.
+    The JSON of the verb: ``joints`` as the diagnosis of a set with ``believed``, ``drafted``, ``asked``; ``arm``;
+    ``closed_loop`` of the user's model before and after. ``InputFileError``, ``ConfigError``: model, logs or map are
+    unusable. ``UsageError``: a joint that is not there, or a file that is.
     """
     arm = sets_from_model(asked)
     pages = {name: (out / f"{part_of_path(name)}.html") for name in arm.joints} if out is not None else {}

@@ -56,17 +56,9 @@ class Varied:
 def fleet(
     results: Sequence[Path], *, samples: int = 0, out: Path | None = None, force: bool = False, seed: int = 1
 ) -> dict[str, Any]:
-    """Tell the spread of a fleet from what ``gap diagnose --model ... --json`` printed, one file a robot.
+    """The spread of a fleet from what ``gap diagnose --json`` printed of each; ``samples`` are drawn into ``out``.
 
-    ``samples`` robots are drawn into ``out``, each as one whole set of numbers.
-
-    Raises:
-        UsageError: too few robots, samples without a file, or a file that is there.
-        InputFileError: no such result, or not one of a diagnosis.
-
-    Returns:
-        The JSON of the verb: ``joints.<joint>.<effect>.<parameter>``, see ``Varied.told``; ``units``; ``samples``
-        (path).
+    ``UsageError``: too few robots, samples without a file, or one that is there. ``InputFileError``: no such result.
     """
     if len(results) < LEAST_UNITS:
         raise UsageError(

@@ -102,17 +102,10 @@ class Recorded:
 
 
 def record(options: GapRecordOptions, watcher: Watcher, *, move: bool = True) -> Recorded:
-    """Record diagnostic experiments: plan, check, ask, run, and write the set.
+    """Record diagnostic experiments: plan, check, ask, run, and write the set; without ``move`` of what ``resume`` has.
 
-    Without ``move``, a set is made of what the run ``options.resume`` has, and no bus is opened.
-
-    Raises:
-        UsageError: refused before anything moved.
-        HardwareError: hardware unreachable.
-
-    Returns:
-        Its ending and the set. A safety abort or an interruption after motion began is an ending; experiments finished
-        before it are in the set.
+    ``UsageError``, ``HardwareError``: before anything moved. Later an error is an ending; what was finished is in the
+    set.
     """
     recording = _Recording(options, watcher, move=move)
     with Run(recording.order, watcher) as run:
@@ -120,11 +113,7 @@ def record(options: GapRecordOptions, watcher: Watcher, *, move: bool = True) ->
 
 
 def recordable(options: GapRecordOptions) -> dict[str, float]:
-    """Duration in s of every experiment that this joint has the room and the payload for, by name.
-
-    Raises:
-        UsageError, ConfigError: as ``record``.
-    """
+    """Duration, s, of every experiment that this joint has room and payload for, by name; raises as ``record``."""
     robot, _, joint, _, without = _situation(options)
     every = list(catalogue(envelope_of(robot, joint, options), seed=options.seed).values())
     return {e.name: e.duration_s for e in (every if without is None else _unloaded(every))}
@@ -144,11 +133,7 @@ def _situation(options: GapRecordOptions) -> tuple[Robot, RobotSetup, JointSetup
 
 
 def recorded_logs(run: Path, joint: str, experiments: Sequence[Experiment]) -> dict[str, Samples]:
-    """The experiments that a run folder holds whole, from all of its parts.
-
-    Raises:
-        InputFileError: a recording is unreadable.
-    """
+    """The experiments that a run folder holds whole, from all of its parts (``InputFileError``: unreadable)."""
     logs: dict[str, Samples] = {}
     for path, _ in parts_of(run):
         if path.suffix == ".mcap":
@@ -445,16 +430,13 @@ DECIDED = 0.95  # chance of the first cause from which nothing more is recorded
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """The result of recording until the cause is decided.
-
-    ``diagnosis`` is of the whole set of the last recording; None where nothing was recorded. ``why`` nothing more was.
-    """
+    """The result of recording until the cause is decided."""
 
     recorded: Recorded
     experiments: tuple[str, ...]
     duration_s: float
-    diagnosis: Diagnosis | None
-    why: str
+    diagnosis: Diagnosis | None  # of the whole set of the last recording; None where nothing was recorded
+    why: str  # nothing more was recorded
 
     def to_json(self) -> dict[str, Any]:
         """The JSON of the verb: that of a recording, and the diagnosis."""
@@ -470,12 +452,7 @@ class Decided:
 
 
 def record_until_decided(options: GapRecordOptions, watcher: Watcher, budget_s: float) -> Decided:
-    """Record and diagnose in turn until the cause is decided or all experiments have taken ``budget_s``.
-
-    Raises:
-        UsageError: refused before anything moved.
-        HardwareError: hardware unreachable before anything moved.
-    """
+    """Record and diagnose in turn until it is decided, or ``budget_s`` is spent; raises before anything moved."""
     if options.plan is not None or options.short or options.resume is not None:
         raise UsageError("--until-decided chooses the experiments itself; leave out --plan, --short and --resume")
     possible = recordable(options)

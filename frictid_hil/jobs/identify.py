@@ -82,12 +82,10 @@ class _Identified:
 
 
 def identify(options: IdentifyOptions, note: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Identify every joint of every recording.
+    """Identify every joint of every recording; ``note`` is told progress.
 
-    Raises:
-        UsageError: nothing to read, options that contradict each other, or a profile would be overwritten.
-        InputFileError: the only recording is unreadable or unusable.
-        IdentificationError: the only recording gives no curve.
+    ``UsageError``: nothing to read, contradictions, or a profile would be overwritten. ``InputFileError``,
+    ``IdentificationError``: of the only recording.
     """
     logs = recordings(options.logs)
     with_pages = options.out is not None and len(logs) <= _MOST_PAGES
@@ -110,13 +108,7 @@ def identify(options: IdentifyOptions, note: Callable[[str], None] = lambda _: N
 
 
 def identified_profile(options: IdentifyOptions) -> FrictionProfile:
-    """The profile of one recording; nothing is written.
-
-    Raises:
-        UsageError: none or several recordings are meant.
-        InputFileError: it is unreadable or unusable.
-        IdentificationError: it gives no curve.
-    """
+    """The profile of one recording, unwritten (``UsageError``: not one; as ``identify``)."""
     logs = recordings(options.logs)
     if len(logs) != 1:
         raise UsageError(f"one recording is expected, {len(logs)} are meant")
@@ -128,11 +120,7 @@ def identified_profile(options: IdentifyOptions) -> FrictionProfile:
 
 
 def recordings(named: Sequence[Path]) -> list[Path]:
-    """Every recording that is meant by files, folders, run folders and globs, each once, in order.
-
-    Raises:
-        UsageError: a name that means nothing.
-    """
+    """Every recording that files, folders, run folders and globs mean, once, in order (``UsageError``: nothing)."""
     found: list[Path] = []
     for name in named:
         base = Path(name.anchor)

@@ -47,15 +47,12 @@ _SCHEMA = {
 
 
 class LiveWatcher:
-    """Passes everything on to another watcher, and every joint's samples to whoever is connected.
-
-    ``refused`` holds the origins of pages that the server turned away; each is told once.
-    """
+    """Passes everything on to another watcher, and every joint's samples to whoever is connected."""
 
     def __init__(self, watcher: Watcher, server: FoxgloveServer, refused: deque[str]) -> None:
         self._watcher = watcher
         self._server = server
-        self._refused = refused
+        self._refused = refused  # origins of pages that the server turned away; each is told once
         self._told: set[str] = set()
         self._due_ns: list[int] = []
         self._epoch_ns = time.time_ns()
@@ -97,11 +94,7 @@ class LiveWatcher:
 
 @contextmanager
 def live(watcher: Watcher, address: str | None) -> Iterator[Watcher]:
-    """The watcher itself, or with ``address`` one that streams as well while the job lasts.
-
-    Raises:
-        UsageError: not ``host:port``, the port is taken, or ``websockets`` is not installed.
-    """
+    """The watcher, or while the job lasts one that streams as well (``UsageError``: no such place, no websockets)."""
     if address is None:
         yield watcher
         return

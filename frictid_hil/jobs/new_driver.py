@@ -18,14 +18,7 @@ _FILES = {
 
 
 def new_driver(name: str, out: Path | None = None) -> list[Path]:
-    """Write the package; the files, in the order in which they are worth reading.
-
-    The folder is not there yet, or empty; ``frictid-NAME`` here where None.
-
-    Raises:
-        UsageError: a name that is none, or a folder with something in it.
-        FrictidError: the folder cannot be written.
-    """
+    """Write the package; its files in the order worth reading (``UsageError``: no name, or a full folder)."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UsageError(f"no name for a driver: {name!r}", next_step="small letters, digits and underscores")
     folder = out or Path(f"frictid-{name}")

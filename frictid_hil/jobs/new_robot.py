@@ -54,14 +54,10 @@ def new_robot(
     read: bool = False,
     force: bool = False,
 ) -> NewRobot:
-    """Write a robot file that loads; nothing moves, and drives are only read.
+    """Write a robot file that loads, the robot named after it; nothing moves, and drives are only read, if ``read``.
 
-    The robot is named after the file. With ``read``, the drives are asked for gear ratio and rated torque.
-
-    Raises:
-        UsageError: the file exists, or a figure is missing that no drive gave.
-        ConfigError: the answers make no robot; every problem with its place.
-        HardwareError: the bus or a drive cannot be reached.
+    ``UsageError``: the file exists, or no drive gave a figure. ``ConfigError``: no robot. ``HardwareError``:
+    unreachable.
     """
     refuse_overwriting([path], force=force)
     setup = RobotSetup(path.stem, bus, cycle_hz, tuple(_provisional(joint) for joint in joints))

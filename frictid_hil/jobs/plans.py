@@ -44,15 +44,12 @@ def calibration_motions(
     joint: JointSetup,
     procedure: Procedure,
     *,
-    rehearse: bool,
+    rehearse: bool,  # its travel was never seen slowly
     warm_up: policy.WarmUpPolicy | None = None,
-    place: int | None = None,
+    place: int | None = None,  # among the joints that move together
     measure_skew: bool = False,
 ) -> list[Motion]:
-    """What one joint does in a calibration, from its locked position and back to it.
-
-    ``rehearse`` where its travel was never seen slowly; ``place`` is that among the joints that move together.
-    """
+    """What one joint does in a calibration, from its locked position and back to it."""
     start, home = joint.start_position_rad, joint.locked_position_rad
     amplitude = procedure.amplitude_rad
     # An early cycle: the later it is run again, the better drift is seen.
@@ -143,11 +140,7 @@ def calibration_plan(
     together: bool = False,
     measure_skew: bool = False,
 ) -> Plan:
-    """The plan of a calibration: joint by joint in the order of ``procedures``, or all of them at once.
-
-    Raises:
-        UsageError: joints that shall move together have procedures of different timing.
-    """
+    """Joint by joint in the order of ``procedures``, or all at once (``UsageError``: these differ in timing)."""
     locked = {joint.name: joint.locked_position_rad for joint in setup.joints}
     if together:
         _refuse_different_timing(procedures)
@@ -190,10 +183,7 @@ def _refuse_different_timing(procedures: Mapping[str, Procedure]) -> None:
 
 
 def _in_step(motions: Mapping[str, Sequence[Motion]]) -> dict[str, list[Motion]]:
-    """The same stretches for every joint, each as long as for the one that needs longest.
-
-    Only moves and slow sines differ: cycles have identical timing already.
-    """
+    """The same stretches for all, as long as for the one that needs longest; cycles have identical timing already."""
     moved_first = any(own[0].name == "move" for own in motions.values())
     lists = {name: list(own) for name, own in motions.items()}
     for own in lists.values():
@@ -225,11 +215,7 @@ def expected_of(robot: Robot) -> dict[str, Expected]:
 def given_procedure(
     amplitude_rad: float | None, velocity_rad_s: float | None, cycles: int | None, ratio: float | None
 ) -> Procedure | None:
-    """The procedure that a recording without marks was made with, as typed; None where nothing was.
-
-    Raises:
-        UsageError: some, but not amplitude and velocity, or values that make no procedure.
-    """
+    """The procedure of a recording without marks, as typed; None without (``UsageError``: not all, or impossible)."""
     if amplitude_rad is not None and velocity_rad_s is not None:
         try:
             return Procedure(amplitude_rad, velocity_rad_s, cycles or 10, ratio or 0.8)

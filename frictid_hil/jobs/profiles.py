@@ -41,17 +41,7 @@ def _by_axis(joint: JointProfile, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def diff(older: str, newer: str, *, robot: str | None = None, store: Path | None = None) -> dict[str, Any]:
-    """How two profiles differ, joint by joint.
-
-    Each is named as for ``named_profile``.
-
-    Raises:
-        ProfileMismatch: no joint in common.
-        UsageError: no such profile.
-
-    Returns:
-        ``warnings``: why they may not be comparable (other robots, other procedures).
-    """
+    """How two profiles, named as for ``named_profile``, differ by joint (``ProfileMismatch``: no joint in common)."""
     (before, before_name), (after, after_name) = (named_profile(text, robot, store) for text in (older, newer))
     joints = {name: _by_axis(after.joints[name], asdict(one)) for name, one in drift(before, after).items()}
     if not joints:
@@ -81,12 +71,8 @@ def promote(
 ) -> dict[str, Any]:
     """Make a profile the active one; joints that it lacks stay as the active profile has them.
 
-    It is named as for ``named_profile``, and added to the store. With ``baseline`` drift is measured from it from now
-    on, too; ``force`` is for failed quality gates; ``told`` is as ``ProfileStore``'s.
-
-    Raises:
-        GateFailed: a quality gate failed.
-        UsageError: no such profile.
+    With ``baseline`` drift is measured from it, too. ``GateFailed``: a gate failed, without ``force``. ``UsageError``:
+    none.
     """
     profile, place = named_profile(named, robot, store)
     failed = {joint: [gate.name for gate in one.gates if not gate.passed] for joint, one in profile.joints.items()}
@@ -137,13 +123,7 @@ _NIGHT = ("utc", "outcome", "promoted", "drifted", "reason", "next_step", "run")
 
 
 def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict[str, Any]:
-    """Profiles, promotions and recalibrations of a robot, oldest first.
-
-    With ``last``, only so many of each.
-
-    Raises:
-        UsageError: nothing is known of such a robot.
-    """
+    """Profiles, promotions and recalibrations, the ``last`` so many, oldest first (``UsageError``: nothing known)."""
     profiles, promotions = store.history(robot, last), store.promotions(robot, last)
     nights = store.attempts(robot, last)
     if not profiles and not nights:
@@ -184,17 +164,9 @@ def unknown_robot(store: ProfileStore, robot: str) -> UsageError:
 
 
 def named_profile(text: str, robot: str | None, store: Path | None) -> tuple[FrictionProfile, Path]:
-    """Find the profile that a person names, and its file. A file takes precedence over an id of the store.
-
-    Args:
-        text: a file, a run folder, or (with ``robot``) an id of the store, ``active`` or ``baseline``.
-        robot: name.
-        store: folder of the store; None for the user's own.
-
-    Raises:
-        UsageError: no such profile; nothing is active yet.
-    """
+    """The profile that a person names, and its file (``UsageError``: no such profile; nothing is active yet)."""
     path = Path(text)
+    # A file or run folder takes precedence over an id of the store, ``active`` or ``baseline``.
     if robot is None or path.exists() or path.suffix:
         place = profile_file(path)
         return load_profile(place), place.resolve()
@@ -223,17 +195,10 @@ POINTS = 20  # rows of a drive's friction table: ten speeds each way
 
 
 def export(profile: Path, target: str, out: Path, *, force: bool = False) -> dict[str, Any]:
-    """Write a profile for another place.
+    """Write a profile for another place: ``table``, ``ros2`` or ``i2rt``.
 
-    The target is ``table``, ``ros2`` or ``i2rt``.
-
-    Raises:
-        UsageError: no such target, or ``out`` exists.
-        ConfigError, IdentificationError: the profile is unusable.
-
-    Returns:
-        ``written`` (absolute path), ``lost``, and ``worst_percent``: how far the written form is from the curve within
-        its measured range, over the curve, the worst joint.
+    ``worst_percent`` is how far that is from the curve within its measured range, over the curve, at the worst joint.
+    ``UsageError``: no such target, or ``out`` exists. ``ConfigError``, ``IdentificationError``: an unusable profile.
     """
     if target not in _TARGETS:
         raise UsageError(f"no target {target!r}", where="--to", next_step=f"one of {', '.join(_TARGETS)}")

@@ -61,13 +61,8 @@ class RecalibrateOptions:
 def recalibrate(options: RecalibrateOptions, watcher: Watcher) -> dict[str, Any]:
     """Run one unattended recalibration from its lock to its journal.
 
-    Raises:
-        UsageError: the robot file is wrong, or gives no permission to move a real robot unattended.
-        HardwareBusy: another recalibration of this robot, or somebody else on its bus.
-        HardwareError: the robot is off or not reachable.
-
-    Returns:
-        The JSON of the verb; a refusal by gates or policy, and an abort after motion began, are outcomes.
+    A refusal by gates or policy, and an abort after motion began, are outcomes. ``UsageError``: the robot file is
+    wrong, or gives no permission. ``HardwareBusy``: somebody else is at work. ``HardwareError``: off, or not reachable.
     """
     robot = load_robot(options.robot)
     store = ProfileStore(options.store)

@@ -51,12 +51,7 @@ class ReplayOptions:
 
 
 def replay(options: ReplayOptions, note: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Play a recording back.
-
-    Raises:
-        UsageError: nothing says which frame is what, options contradict each other, or a file would be overwritten.
-        InputFileError: the recording is unreadable or unusable.
-    """
+    """Play a recording back (``UsageError``: unknown frames, contradictions, a file is there; ``InputFileError``)."""
     return _Replay(options, note).result()
 
 
@@ -240,16 +235,13 @@ _CONTROL_PERIOD_S = 0.001
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedReplay:
-    """One joint, measured (``samples``) and simulated without noise on the same rows, shape (n,).
-
-    ``note`` is what a reader should know of the set-points.
-    """
+    """One joint, measured (``samples``) and simulated without noise on the same rows, shape (n,)."""
 
     samples: Samples
     position_rad: Array
     velocity_rad_s: Array
     torque_nm: Array
-    note: str = ""
+    note: str = ""  # what a reader should know of the set-points
 
     @property
     def position_rms_rad(self) -> float:
@@ -277,13 +269,10 @@ class SimulatedReplay:
 
 
 def simulate(robot: Robot, samples: Samples) -> SimulatedReplay:
-    """Stream a recording's set-points to the joint that the robot file describes under ``simulated``.
+    """Stream a recording's set-points to the robot file's ``simulated`` joint (``ConfigError``: a wrong mapping).
 
-    The joint starts at rest, powered, where the recording starts; set-point k is in force from t_k on, and rows follow
-    the timing of a live run (position at t_k, mean torque of what led to it).
-
-    Raises:
-        ConfigError: the ``simulated`` mapping is wrong, with its place.
+    It starts at rest, powered, where the recording does; set-point k is in force from t_k on, and rows follow the
+    timing of a live run (position at t_k, mean torque of what led to it).
     """
     from frictid_hil.simulation.joint import JointModel  # loads numba; a replay without simulation does not need it
     from frictid_hil.simulation.servo_loop import ServoLoop

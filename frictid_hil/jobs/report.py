@@ -31,13 +31,9 @@ def report(
     store: Path | None = None,
     told: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Write ``report.html`` into a run folder, or the index page of a robot.
+    """Write ``report.html`` into a run folder, or the index page of a robot, named by file or as the store knows it.
 
-    A run of compensation has its page since it ended, and is told where it is. A robot is named by its file, or by the
-    name that the store knows. ``told`` is as ``ProfileStore``'s.
-
-    Raises:
-        UsageError: neither or both; not a run folder; nothing was identified in it; nothing known of the robot.
+    ``UsageError``: not one of both; no run, or nothing identified in it; nothing known of the robot.
     """
     if (run is None) == (robot is None):
         raise UsageError("name one: the folder of a run, or a robot with --robot")
@@ -95,13 +91,7 @@ def write_index_page(store: ProfileStore, robot: str) -> Path:
 
 
 def page_of(store: ProfileStore, robot: str, address: Callable[[Path], str]) -> Page:
-    """The index page of a robot.
-
-    ``address`` is of the page of a night, by its run folder; "" where it cannot be reached.
-
-    Raises:
-        UsageError: nothing is known of such a robot.
-    """
+    """The index page of a robot; ``address`` is of a night's page, or "" (``UsageError``: nothing is known of it)."""
     trends, nights = store.trends(robot), store.attempts(robot)
     if not trends and not nights:
         raise unknown_robot(store, robot)

@@ -11,15 +11,7 @@ from frictid_hil.protocol.driver import Finding, Resettable, new_driver
 
 
 def reset(robot_name: str, *, bus: str | None = None, ask: Callable[[list[Finding]], bool]) -> dict[str, Any]:
-    """Show what the faults are, ask, and reset them.
-
-    ``ask`` is shown the faults; False leaves everything as it is.
-
-    Raises:
-        UsageError: this robot's driver has no such thing.
-        PlanRefused: the person said no.
-        HardwareError: a drive does not answer, has power, or stays in fault.
-    """
+    """Show the faults, ask, and reset (``UsageError``: no such driver; ``PlanRefused``: a no; ``HardwareError``)."""
     robot = load_robot(robot_name)
     setup = robot.to_setup(bus)
     with robot.document.locating():

@@ -46,13 +46,7 @@ class ScheduleOptions:
 
 
 def schedule(options: ScheduleOptions) -> dict[str, Any]:
-    """Write the units, verified; nothing is enabled or started.
-
-    Raises:
-        UsageError: a calendar expression that systemd refuses, an account that does not exist here, or a robot that may
-            not be moved unattended.
-        FrictidError: a folder that cannot be written, or units that systemd refuses.
-    """
+    """Write the units, verified; nothing is enabled (``UsageError``: calendar, account, permission)."""
     robot = load_robot(options.robot)
     if robot.policy.unattended is None and not robot.kind(options.bus).simulated:
         raise UsageError(
@@ -108,11 +102,7 @@ def _enable(options: ScheduleOptions, paths: list[Path]) -> str:
 
 
 def next_elapse(on_calendar: str) -> str | None:
-    """When an expression comes true next, by systemd itself; None where systemd is not installed.
-
-    Raises:
-        UsageError: systemd does not understand it, or it never comes true.
-    """
+    """When it comes true next, by systemd itself; None without systemd (``UsageError``: unreadable, or never)."""
     if not on_calendar.strip() or "\n" in on_calendar:
         raise UsageError(f"no calendar expression: {on_calendar!r}", next_step=_EXAMPLE)
     tool = shutil.which("systemd-analyze")
@@ -135,11 +125,7 @@ def next_elapse(on_calendar: str) -> str | None:
 
 
 def verify(units: dict[str, str], *, system: bool) -> bool:
-    """Have systemd check the units; False where systemd is not installed.
-
-    Raises:
-        FrictidError: systemd refuses them; its own words.
-    """
+    """Have systemd check the units; False where it is not installed (``FrictidError``: it refuses; its own words)."""
     tool = shutil.which("systemd-analyze")
     if tool is None:
         return False
@@ -299,14 +285,10 @@ _PART = re.compile(r"(\d+)(?:\.\.(\d+))?(?:/(\d+))?", re.ASCII)
 
 
 def cron_fields(on_calendar: str) -> str:
-    """Minute, hour, day, month and weekday of a crontab line that comes true exactly when the expression does.
+    """Fields of a crontab line that comes true exactly when an expression does (``UsageError``: cron cannot say it).
 
-    The expression is valid for ``systemd-analyze calendar``. cron knows the local clock and no years, seconds or time
-    zones, and no days counted from the end of a month (``~``). Where both a day and a weekday are given, systemd wants
-    both and cron takes either (``man 5 crontab``); such an expression is not translated.
-
-    Raises:
-        UsageError: cron cannot say it; why.
+    cron knows the local clock and no years, seconds or time zones, and no days counted from the end of a month (``~``).
+    Where a day and a weekday are given, systemd wants both, cron takes either (``man 5 crontab``): not translated.
     """
     words = _SHORTHANDS.get(on_calendar.strip().lower(), on_calendar).split()
     weekdays = "*"

@@ -93,11 +93,7 @@ def mode_run(samples: Samples, mark: Mark, motion: Compensated, mode: str, perio
 def figures(
     runs: Mapping[str, ModeRun], task: str, inertia_kg_m2: float | None, floors_rad: Mapping[str, float] | None = None
 ) -> dict[str, ModeFigures]:
-    """The figures of all modes, each one compared with ``nc`` where that ran.
-
-    The inertia is removed from the hand torque; ``floors_rad`` is, by mode, what an ideal joint's tracking error would
-    be.
-    """
+    """The figures of all modes, each against ``nc``; ``floors_rad``, by mode, is an ideal joint's tracking error."""
     floors_rad = floors_rad or {}
     alone = {mode: _alone(run, task, inertia_kg_m2) for mode, run in runs.items()}
     base = alone.get("nc")
@@ -131,11 +127,7 @@ def _with_intervals(figure: ModeFigures, own: Array | None, base: Array | None) 
 
 
 def friction_dominates(found: Mapping[str, ModeFigures]) -> bool | None:
-    """Whether friction, not inertia under so weak a PD, makes the tracking error; None without nc and mop-reference.
-
-    Its measure is the ceiling of ``mop-reference``: what an ideal joint of this inertia, under these gains, would gain
-    if its friction were given back exactly and at once.
-    """
+    """Whether friction, not inertia, makes the tracking error, by the ceiling of mop-reference; None if unknown."""
     ceiling = found["mop-reference"].ceiling_percent if "mop-reference" in found else None
     return None if ceiling is None else ceiling >= DOMINATED_PERCENT
 

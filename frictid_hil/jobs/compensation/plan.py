@@ -44,12 +44,7 @@ _SLEW_PER_COULOMB = 400.0
 
 
 def law_of(entry: JointProfile, joint: JointSetup, mode: str, wanted: Wanted, warnings: list[str]) -> ControlLaw:
-    """The law of one mode.
-
-    Raises:
-        UsageError: an unstable R or K.
-        ProfileMismatch: the profile lacks a figure that this needs.
-    """
+    """The law of one mode (``UsageError``: an unstable R or K; ``ProfileMismatch``: the profile lacks a figure)."""
     where = f"joint {joint.name}"
     curve = entry.curve()
     gravity = Gravity(
@@ -85,12 +80,7 @@ def law_of(entry: JointProfile, joint: JointSetup, mode: str, wanted: Wanted, wa
 def friction_settings(
     entry: JointProfile, mode: str, wanted: Wanted, where: str, warnings: list[str]
 ) -> CompensationSettings:
-    """R, K and curve of one mode.
-
-    Raises:
-        UsageError: an unstable R or K.
-        ProfileMismatch: no presliding stiffness was identified, and no K is given.
-    """
+    """R, K and curve of one mode (``UsageError``: unstable; ``ProfileMismatch``: no K, nor a stiffness)."""
     presliding = entry.presliding_stiffness_nm_per_rad.value
     ours = wanted.setting == "ours"
     # R of our setting is lower where the encoder hides presliding.
@@ -197,16 +187,9 @@ def compensation_plan(
     entry: JointProfile,
     wanted: Wanted,
     rehearsals: Rehearsals,
-    forced: Sequence[str],
+    forced: Sequence[str],  # warnings of what is done in spite of doubts
 ) -> Asked:
-    """The plan of one joint; a travel that was never seen on this robot is rehearsed first.
-
-    ``forced`` are warnings of what is done in spite of doubts.
-
-    Raises:
-        UsageError: options that contradict each other, or an unstable R or K.
-        ProfileMismatch: the profile lacks a figure that this needs.
-    """
+    """The plan of one joint, a travel that is new to this robot rehearsed first; raises as ``law_of``."""
     joint = setup.joint(name)
     refuse_contradictions(wanted)
     centre_rad = calibrated_centre_rad(entry, joint) if wanted.centre_rad is None else wanted.centre_rad

@@ -19,11 +19,7 @@ _EQUAL = 0.01  # rated torque and gear ratio agree within this share
 
 
 def doubts_of_file(profile: FrictionProfile, joint: JointSetup, robot: str, policy: Policy) -> list[str]:
-    """What speaks against a profile before any drive was read.
-
-    Raises:
-        ProfileMismatch: the profile has no such joint, or a curve that cannot be friction; no force helps there.
-    """
+    """What speaks against a profile before any drive was read (``ProfileMismatch``: what no force helps against)."""
     entry = profile.joint(joint.name)
     _refuse_nonsense(entry, joint)
     doubts = []

@@ -37,13 +37,7 @@ class Belief:
 def belief_of(
     joint: JointSetup, profile: JointProfile | None, *, profile_name: str = "", simulated_drive: bool = False
 ) -> Belief:
-    """Form what is believed about one joint before its logs are looked at.
-
-    The controller is known where the drive is simulated too.
-
-    Raises:
-        InvalidFields: the ``simulated`` mapping is wrong.
-    """
+    """What is believed of a joint before its logs are looked at (``InvalidFields``: a wrong ``simulated`` mapping)."""
     sections: dict[str, Any] = {"joint": {"gear_ratio": joint.gear_ratio}}
     sources: list[str] = []
     if joint.simulated:

@@ -80,10 +80,7 @@ def _by_part(off: Sequence[Array], motions: Sequence[Motion], joint: int) -> Arr
 
 
 def side_by_side(arm: ArmSet, natives: Mapping[str, Native]) -> tuple[JointRun, ...]:
-    """Each joint along the last log that was not fitted, its beginning: measured, the user's model, and improved.
-
-    Nothing where ``closed_loop_gap`` has a reason. Torques behind the low-pass; positions where no torque is known.
-    """
+    """Measured, the user's model and improved, by joint, along the last log not fitted; of torque, or position."""
     short = withheld(arm)[-1].beginning(SHOWN_S)
     if why_no_closed_loop(arm, [short]):
         return ()
@@ -116,10 +113,7 @@ def low_pass(time_s: Array) -> Callable[[Array], Array]:
 def gap_of(
     arm: ArmSet, natives: Mapping[str, Native], motions: Sequence[Motion], model: Any = None
 ) -> tuple[Array, Array]:
-    """RMS of (torque, position) of recordings less the changed model's, (k,) each; torque is NaN where none is known.
-
-    ``model`` is another one, compiled, instead of the user's with the changes.
-    """
+    """RMS of (torque, position) of recordings less the changed model's or ``model``'s, (k,) each; NaN: not known."""
     torque, position = _each(arm, natives, motions, model)
     return _rms(torque), _rms(position)
 

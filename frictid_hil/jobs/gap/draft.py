@@ -28,11 +28,7 @@ LARGEST_TOLERANCE = 0.5
 
 
 def drafted(logs: ExperimentSet) -> dict[str, Any]:
-    """``joint``, ``tolerance`` and ``draft`` (what it was made of, what is left) of a first ``nominal.yaml``.
-
-    Raises:
-        InputFileError: no log has a torque.
-    """
+    """``joint``, ``tolerance`` and ``draft`` of a first ``nominal.yaml`` (``InputFileError``: no log has a torque)."""
     known = [log for log in logs.experiments if log.torque_nm is not None]
     if not known:
         raise InputFileError(

@@ -58,15 +58,7 @@ if __name__ == "__main__":
 
 
 def export_mujoco(path: Path, name: str, model: JointModel) -> dict[str, Any]:
-    """Write ``path`` (MJCF) and a Python file of the same name beside it.
-
-    Raises:
-        UsageError: the name ends in ``.py``.
-        FrictidError: disk full, or no permission.
-
-    Returns:
-        ``model`` and ``callback_script`` (absolute paths), ``in_model``, ``in_callback`` (by effect), ``lost``.
-    """
+    """Write ``path`` (MJCF) and a script beside it; what went where, what is lost (``UsageError``: it ends in .py)."""
     script = path.with_suffix(".py")
     if script == path:
         raise UsageError("is the name of the callback's script", where=str(path), next_step="name the model FILE.xml")

@@ -48,23 +48,18 @@ _ITSELF = "our own evaluation of the file, not run there"
 
 
 class Withheld:
-    """The last motion that was not fitted, and what the machine gave there beyond what the bodies need.
-
-    Attributes:
-        joints: whose torque error counts.
-        size: RMS of their measured torque, N m.
-    """
+    """The last motion that was not fitted, and what the machine gave there beyond what the bodies need."""
 
     def __init__(self, arm: ArmSet, changed: Iterable[str]) -> None:
         self.arm = arm
         self.motion = withheld(arm)[-1].beginning(LAW_S)
-        self.joints = tuple(changed) or arm.recorded
+        self.joints = tuple(changed) or arm.recorded  # whose torque error counts
         self._smooth = low_pass(self.motion.time_s)
         measured = {n: s.torque_nm for n, s in self.motion.samples.items() if s.torque_nm is not None}
         self.known = set(self.joints) <= set(measured)
         if not self.known:
             return
-        self.size = {name: plain_rms(measured[name]) for name in self.joints}
+        self.size = {name: plain_rms(measured[name]) for name in self.joints}  # of the measured torque, N m
         moved = self.motion.moved
         bodies = arm.robot.rigid_body_torque(arm.recorded, *moved, arm.held)
         if arm.found is not None and arm.found.torque is not None:
@@ -130,10 +125,7 @@ def figure_of_target(motion: Withheld, target: str, texts: Mapping[str, str], lo
 
 
 def figures_of_model(motion: Withheld, natives: Mapping[str, Native], told: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of the user's improved model: in MuJoCo, and for a short while in the other engines that are installed.
-
-    Where it cannot run in closed loop, its friction is read back from the edited file.
-    """
+    """Rows of the improved model in MuJoCo, shortly in other engines, or as read from its file where it cannot run."""
     if not motion.known:
         return []
     if "reason" in told:
@@ -208,24 +200,16 @@ _SIGMAS = 2.0 * 1.96  # standard deviations in a 95 % interval
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What to write beside the model.
+    """What to write beside the model."""
 
-    Paths are by target, see ``targets.TARGETS``; ``samples`` of the posterior are drawn; ``newton`` is laid over the
-    joints of ``stage``, and writes a stage of its own without.
-    """
-
-    files: Mapping[str, Path]
-    samples: int = 0
+    files: Mapping[str, Path]  # by target, see ``targets.TARGETS``
+    samples: int = 0  # of the posterior, to be drawn
     seed: int = 1
-    stage: Path | None = None
+    stage: Path | None = None  # over whose joints ``newton`` is laid; without it a stage of its own
 
     @staticmethod
     def of(words: Sequence[str], samples: int, stage: Path | None = None) -> Wanted:
-        """Read what is wanted from words of the form ``TARGET=FILE``.
-
-        Raises:
-            UsageError: no such target, no file, or samples asked for that nobody writes.
-        """
+        """From words of the form ``TARGET=FILE`` (``UsageError``: no target or file, or samples that nobody writes)."""
         files = {}
         for word in words:
             target, equals, file = word.partition("=")
@@ -246,11 +230,7 @@ class Wanted:
 
 
 def check_targets(arm: ArmSet, wanted: Wanted) -> None:
-    """Refuse what cannot be written before anything is computed.
-
-    Raises:
-        ConfigError, InputFileError, UsageError: the stage, or the lack of one; see ``usd``.
-    """
+    """Refuse, before anything is computed, a stage that cannot be written, or that is not there; raises as ``usd``."""
     if "newton" not in wanted.files:
         return
     if wanted.stage is None:
@@ -264,12 +244,8 @@ def write_targets(
 ) -> dict[str, Any]:
     """Write every target that is wanted, of all joints with a friction curve; with the causes that ``made`` has.
 
-    Raises:
-        UsageError: a file is there already.
-
-    Returns:
-        By target: ``files`` (absolute paths), ``effects`` (by joint, where each went: None where the target cannot hold
-        it), ``lost`` and ``figures``, see ``Withheld.row``.
+    By target: ``files``, ``effects`` (by joint, where each went or None), ``lost`` and ``figures``, see
+    ``Withheld.row``. ``UsageError``: a file is there already.
     """
     joints, samples = {}, {}
     random = np.random.default_rng(wanted.seed)

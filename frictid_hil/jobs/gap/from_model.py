@@ -37,22 +37,17 @@ INERTIA_POSTURES = 40
 
 @dataclass(frozen=True, slots=True)
 class ModelLogs:
-    """What is asked: a model, recordings, and what the model does not say.
-
-    See ``frictid-hil gap diagnose --help``. Names of joints are ``NAME`` or ``NAME=NAME_IN_LOG``; ``held`` is the place
-    in rad (m) of joints that no log has; ``tolerances`` are one-sigma by ``NUMBER`` or ``JOINT:NUMBER``; the sections
-    of ``nominal`` (controller, drive, encoder, ...) say more than the model does, or better, of all joints.
-    """
+    """What is asked: a model, recordings, and what the model does not say; see ``gap diagnose --help``."""
 
     model: Path
     logs: Sequence[Path]
-    joints: Sequence[str] = ()
+    joints: Sequence[str] = ()  # ``NAME`` or ``NAME=NAME_IN_LOG``
     columns: str | None = None
-    held: Mapping[str, float] | None = None
-    tolerances: Mapping[str, float | str] | None = None
+    held: Mapping[str, float] | None = None  # place of joints that no log has, rad (m)
+    tolerances: Mapping[str, float | str] | None = None  # one-sigma by ``NUMBER`` or ``JOINT:NUMBER``
     validation: Sequence[str] = ()
     split: str = ""
-    nominal: Path | None = None
+    nominal: Path | None = None  # its sections say more than the model does, or better, of all joints
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,12 +116,7 @@ class ArmSet:
 
 
 def sets_from_model(asked: ModelLogs) -> ArmSet:
-    """Read model and recordings.
-
-    Raises:
-        UsageError: a joint, log or number that is not there; the place of a joint that matters is not told.
-        InputFileError, ConfigError: an unusable model, recording or map.
-    """
+    """Read model and recordings (``UsageError``: what is not there, or told; ``InputFileError``, ``ConfigError``)."""
     robot = RobotModel.load(find(asked.model, folder="models", what="robot model"))
     motions = _motions(asked, robot)
     names = tuple(motions[0].samples)

@@ -32,11 +32,7 @@ VALIDATION_SHARE = 1.0 / 3.0  # part of the recorded time, its end, that is judg
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """What is diagnosed: a set's folder, or recordings that lie anywhere, with a belief.
-
-    Roles of such recordings come from ``validation``, else from what ``nominal`` says of logs of the same name, else
-    from time: the last log, or the last third of a single one, is judged on.
-    """
+    """What is diagnosed: a set's folder, or recordings that lie anywhere, with a belief."""
 
     paths: Sequence[Path]
     columns: str | None = None
@@ -44,16 +40,12 @@ class Source:
     nominal: Path | None = None
     profile: Path | None = None  # friction profile or run folder, whose numbers overrule it
     joint: str | None = None
-    validation: Sequence[str] = ()  # names of logs (file names without ending) to judge on; ``split`` see ``parted``
-    split: str = ""
+    # Logs to judge on (files without ending); else as ``nominal`` says of logs of the same name, else by time.
+    validation: Sequence[str] = ()
+    split: str = ""  # see ``parted``
 
     def load(self) -> ExperimentSet:
-        """Read the set.
-
-        Raises:
-            UsageError: a folder beside other paths or with options of single logs; several joints and none named.
-            InputFileError, ConfigError: an unusable recording, map, nominal joint or profile.
-        """
+        """Read it (``UsageError``: a set beside others, or no joint named; ``InputFileError``, ``ConfigError``)."""
         folders = [path for path in self.paths if (path / "nominal.yaml").exists()]
         options = (self.columns, self.nominal, self.profile, self.joint, self.split, *self.validation)
         if not folders and len(self.paths) == 1 and self.paths[0].is_dir() and not any(options):
@@ -92,16 +84,11 @@ def listed_as(name: str, judged: bool, order: int, *, payload: bool = False) -> 
 def parted(
     logs: Sequence[tuple[str, Samples]], validation: Sequence[str] = (), split: str = ""
 ) -> list[tuple[str, str, NDArray[np.bool_], bool]]:
-    """Divide the recordings into those that are fitted and those that the result is judged on.
+    """Part recordings into what is fitted and what is judged on: (name of the part, of its log, rows, judged on).
 
     Unless told: the last third of one log, else the last logs that make up a quarter or more. ``split`` is ``log`` for
-    whole logs; ``30%`` or ``20s`` by time, the end of every log being judged on.
-
-    Raises:
-        UsageError: two logs of one name, a name that no log has, or a split that cannot be read or leaves nothing.
-
-    Returns:
-        (name of the part, name of its log, its rows, judged on).
+    whole logs; ``30%`` or ``20s`` of the end of every log. ``UsageError``: unreadable, or nothing is left; unknown
+    names.
     """
     names = [name for name, _ in logs]
     twice = [name for name in names if names.count(name) > 1]
@@ -219,11 +206,7 @@ _CONVENTION = "tau = inertia*acc + gravity_cos*cos(position) + gravity_sin*sin(p
 
 
 def existing_set(folder: Path, robot: str, joint: str) -> Mapping[str, Any] | None:
-    """``nominal.yaml`` of a set that experiments shall be added to; None where there is no set yet.
-
-    Raises:
-        UsageError: the folder holds something else, or a set of another joint.
-    """
+    """``nominal.yaml`` of a set to add to, None without (``UsageError``: something else, or a set of another joint)."""
     path = folder / "nominal.yaml"
     if not path.exists():
         if folder.exists() and any(folder.iterdir()):
@@ -249,13 +232,7 @@ def write_set(
     *,
     earlier: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write logs, then ``nominal.yaml`` that lists them.
-
-    Experiments are added to ``earlier`` ones; one that is there already goes on as ``chirp_2``, ``chirp_3``, ...
-
-    Raises:
-        FrictidError: disk full, or no permission.
-    """
+    """Write logs, then ``nominal.yaml`` that lists them, after ``earlier`` ones; a second ``chirp`` is ``chirp_2``."""
     made_folder(folder)
     listed = list(earlier["experiments"]) if earlier else []
     for experiment, samples in logs:

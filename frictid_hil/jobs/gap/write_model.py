@@ -31,14 +31,12 @@ _FRICTIONLESS = FrictionCurve.through(np.array([1.0, 2.0]), np.array([1e-9, 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """One joint's part of an improved model.
-
-    ``off`` is, by form of friction that was tried, torque on withheld motion against our own simulation, over its RMS.
-    """
+    """One joint's part of an improved model."""
 
     model: JointModel
     native: Native
     form: str
+    # By form that was tried: torque on withheld motion against our own simulation, over its RMS.
     off: Mapping[str, float]
 
 
@@ -48,10 +46,7 @@ def natives(made: Mapping[str, Export]) -> dict[str, Native]:
 
 
 def exports(arm: ArmSet, found: Mapping[str, Diagnosis], *, apply: bool = False) -> dict[str, Export]:
-    """What to change in the user's model, by joint; only joints with named causes, or drafted friction.
-
-    With ``apply``, the likeliest causes where the verdict is open, too.
-    """
+    """What to change, of joints with named causes (``apply``: or the likeliest, if open) or drafted friction."""
     wanted = {name: applied(found[name], apply=apply) for name in arm.joints}
     if not any(s.torque_nm is not None for motion in arm.motions for s in motion.samples.values()):
         return _exports_by_position(arm, {name: effects for name, effects in wanted.items() if effects})
@@ -64,10 +59,7 @@ def exports(arm: ArmSet, found: Mapping[str, Diagnosis], *, apply: bool = False)
 
 
 def _exports_by_position(arm: ArmSet, wanted: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, Export]:
-    """Where no torque is known: what is late, on joints where the user's engine comes nearer to the fitted positions.
-
-    A chain from command to position holds the lag of the servo's loop, which the model has too: it is taken off.
-    """
+    """Without torques: what is late beyond the model's own loop, where that comes nearer to fitted positions."""
     motions, names = fitted(arm), arm.recorded
     if not wanted or why_no_closed_loop(arm, motions) is not None:
         return {}
@@ -160,10 +152,7 @@ def joint_model(
 def export_of(
     arm: ArmSet, joint: JointSet, effects: Mapping[str, Mapping[str, float]], presliding_nm_per_rad: float | None
 ) -> Export:
-    """The change of a joint with these effects, in the form of friction that comes nearest to our own simulation.
-
-    The presliding stiffness is as believed where None.
-    """
+    """A joint with these effects, in the form of friction nearest to our simulation; stiffness as believed if None."""
     robot, name = arm.robot, joint.believed.name
     model = joint_model(joint, effects, presliding_nm_per_rad)
     use = use_of(arm, name)
@@ -231,13 +220,8 @@ def _withheld(arm: ArmSet, name: str) -> tuple[Array, Array, Array]:
 def write_model(arm: ArmSet, made: Mapping[str, Export], out: Path, *, force: bool = False) -> dict[str, Any]:
     """Write the user's model with the changes, after comparing it with the original.
 
-    Raises:
-        UsageError: a file is there already.
-        FrictidError: the edited model is not the old one in all else; nothing is written.
-
-    Returns:
-        ``model`` and ``files`` (absolute paths), ``joints`` by name: where each effect went, what is lost, and the
-        torque difference in percent.
+    ``UsageError``: a file is there. ``FrictidError``: the edited model is not the old one in all else; nothing is
+    written.
     """
     changes = natives(made)
     after = compiled_with(arm.robot, changes)

@@ -76,10 +76,7 @@ class PathTime:
 
 
 def path_time(samples: Samples, procedure: Procedure, start_ns: int) -> PathTime | None:
-    """The time of the path; None where it is run time, or nothing tells.
-
-    The samples are of the whole run; cycle 1 starts at run time ``start_ns``.
-    """
+    """The time of the path of a run; None where it is run time, or nothing tells. Cycle 1 starts at ``start_ns``."""
     if any(STOPS in mark.details for mark in samples.marks):
         noted = sorted(tuple(stop) for mark in samples.marks for stop in mark.details.get(STOPS, ()))
         if not noted:
@@ -145,10 +142,7 @@ def cycle_recording(
     together: tuple[str, ...] = (),
     company: Sequence[Samples] = (),
 ) -> tuple[Samples, CycleRecording, list[str]]:
-    """Samples on the time of the path, what the estimator is given of them, and what is to be said of both.
-
-    Samples are of whole runs; cycle 1 starts at run time ``start_s``.
-    """
+    """Whole runs on the time of the path, what the estimator is given of them, and what is to be said of both."""
     notes = told_of(samples)
     path = path_time(samples, procedure, round(start_s * 1e9))
     if path is not None:

@@ -21,12 +21,7 @@ Answer = TypeVar("Answer")
 
 @contextlib.contextmanager
 def executor(named: str | None, tasks: int) -> Iterator[Executor | None]:
-    """Open the executor; None stands for this process.
-
-    Raises:
-        UsageError: no such executor, or its package is missing.
-        HardwareError: no cluster answers there.
-    """
+    """Open the executor, None for this process (``UsageError``: no such; ``HardwareError``: no cluster there)."""
     if named is None and tasks <= SERIAL_UP_TO:
         yield None
         return

@@ -48,27 +48,15 @@ _PROCEDURE_KEYS = ("amplitude_rad", "velocity_rad_s", "cycles", "ratio")
 
 
 def identify_joint(
-    samples: Samples,
-    joint: JointSetup | None,
+    samples: Samples,  # of the whole run of the joint, with marks; or of a foreign recording, without
+    joint: JointSetup | None,  # limits and gear, where a robot file tells
     *,
-    method: str,
-    procedure: Procedure | None = None,
-    late_cycles: int = 0,
-    company: Sequence[Samples] = (),
+    method: str,  # estimator
+    procedure: Procedure | None = None,  # of a recording without marks; else plateaus are looked for, then any motion
+    late_cycles: int = 0,  # that came late or were missed
+    company: Sequence[Samples] = (),  # of joints that moved together, whole runs too; it may be among them
 ) -> JointProfile:
-    """Identify one joint.
-
-    Args:
-        samples: of the whole run of the joint, with marks; or of a foreign recording, without.
-        joint: limits and gear, where a robot file tells.
-        method: estimator.
-        procedure: of a recording without marks; without it, plateaus of constant speed are looked for, then any motion.
-        late_cycles: control cycles that came late or were missed.
-        company: of the joints that moved together with it, where they did, whole runs too; it may be among them.
-
-    Raises:
-        IdentificationError: no curve can be formed; the reason names cycle or speed.
-    """
+    """Identify one joint (``IdentificationError``: no curve can be formed; the reason names cycle or speed)."""
     if samples.torque_nm is None:
         raise IdentificationError("the recording has no torque", where=f"joint {samples.joint}")
     if samples.marks:

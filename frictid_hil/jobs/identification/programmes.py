@@ -31,10 +31,7 @@ class Programme:
     error_percent: float
 
     def note(self, procedure: Procedure, rate_hz: float, quantum_s: float = 0.0) -> str:
-        """What a person should expect of it, in a sentence; an accuracy is promised only where it was measured.
-
-        ``quantum_s`` is of the positions' time where a controller cycles by itself; 0 on a bus that we cycle.
-        """
+        """What to expect, accuracy only where measured; ``quantum_s`` of a controller that cycles by itself, else 0."""
         cycles = len(self.shares) or _CYCLES
         compared = (
             (f"A = {format_angle(procedure.amplitude_rad)}", degrees(procedure.amplitude_rad), _AMPLITUDE),

@@ -69,11 +69,7 @@ def wanted_note(terms: Terms, level_nm: float) -> str:
 
 
 def refuse_where_the_bus_is_too_slow(setup: RobotSetup, quantum_s: float, *, together: bool) -> None:
-    """Judge, before anything is planned, whether the stretch can be made.
-
-    Raises:
-        UsageError: too few set-points a second, a controller that interpolates them, or joints that move at once.
-    """
+    """Judge, before anything is planned, whether the stretch can be made (``UsageError``: it cannot)."""
     if together:
         raise UsageError(
             "the torque's delay is measured on one joint at a time: others would shake it, too",
