@@ -64,12 +64,10 @@ class BatchRunner:
         return [joint.name for joint in self.joints]
 
     def run(self, session: int, plan: JointPlan) -> tuple[JointRun, int]:
-        """Run the whole plan of one joint; returns its run, and the run time at its end in ns.
+        """Run one joint's whole plan; its run, and the run time at its end, ns.
 
-        Raises:
-            SafetyAbort: by the supervisor, or by the controller.
-            Interrupted: asked to stop; the joint stands.
-            HardwareError: the line failed, or a transfer broke for good.
+        ``SafetyAbort``: by supervisor or controller. ``Interrupted``: it stands. ``HardwareError``: the line or
+        transfer broke.
         """
         driver, moving = self.driver, self._names.index(plan.joint)
         self.notify(PhaseStarted(plan.joint, "reference", 0.0))
@@ -106,10 +104,7 @@ class BatchRunner:
     # -- one job ------------------------------------------------------------------------------------------------
 
     def _jobs(self, here_rad: float, motions: Sequence[Motion]) -> list[list[Motion]]:
-        """Cut the motions into jobs behind the rehearsal, with an approach where they begin elsewhere.
-
-        Everything that is measured stays in one job, so that neither a transfer nor a pause comes in between.
-        """
+        """Jobs, cut behind the rehearsal: all that is measured is one job, without a transfer or a pause in between."""
         every = from_here(here_rad, motions, self.care.approach_rad_s)
         cut = max((k + 1 for k, motion in enumerate(every) if motion.name == REHEARSAL), default=0)
         return [job for job in (every[:cut], every[cut:]) if job]

@@ -57,11 +57,9 @@ class Care:
         """How far a joint may be from its set-point while it stands."""
         return self.still_rad + self.droop_of(joint)
 
+    # From set-point to motion ``command_delay_s`` is normal for this driver.
     def limits(self, joint: JointSetup, plan: JointPlan, command_delay_s: float) -> JointLimits:
-        """What the supervisor holds a joint to while this plan runs, whether it is the one that moves or not.
-
-        From set-point to motion ``command_delay_s`` is normal for this driver.
-        """
+        """What the supervisor holds a joint to while this plan runs, whether it is the one that moves or not."""
         low, high = joint.position_min_rad, joint.position_max_rad
         velocity = joint.max_velocity_rad_s
         if joint.name == plan.joint:

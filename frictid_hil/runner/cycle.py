@@ -173,11 +173,9 @@ class CyclicLoop:
             self.pump()
         return feedback
 
+    # ``ending`` brings the only joint to rest when asked to; without one all decelerate along their paths.
     def run(self, sources: Mapping[int, SetPointSource], *, ending: SetPointSource | None = None) -> None:
-        """Stream one motion of every joint that moves, by its index, cycle by cycle, until the first one ends.
-
-        ``ending`` brings the only joint to rest when asked to; without one all decelerate along their paths.
-        """
+        """Stream one motion of every joint that moves, by its index, cycle by cycle, until the first one ends."""
         moving = [(joint, source, self.set_points[joint]) for joint, source in sources.items()]
         previous_rad = [set_point.position_rad for _, _, set_point in moving]
         while True:

@@ -61,12 +61,7 @@ class Motions:
         return {index: LawRunner(self.loop, joint, index, self.limits[index]) for index, joint in self.joints.items()}
 
     def run(self, plans: Mapping[int, JointPlan]) -> dict[int, list[Mark]]:
-        """Run all motions of the plans, in order; returns the marks of each joint.
-
-        Raises:
-            SafetyAbort: by the supervisor, or friction is not what it must be.
-            Interrupted: asked to stop; all joints were brought to rest.
-        """
+        """Run the motions in order; the marks of each joint (``SafetyAbort``, or ``Interrupted``: all at rest)."""
         loop, name = self.loop, stretch_name(list(plans.values()))
         marks: dict[int, list[Mark]] = {index: [] for index in plans}
         for motions in self._from_here({index: plan.motions for index, plan in plans.items()}):

@@ -39,12 +39,7 @@ class ProbeWatch:
         return self.source.update(feedback, set_point)
 
     def judge(self) -> None:
-        """Compare what was measured with the profile.
-
-        Raises:
-            SafetyAbort: the joint did not move both ways.
-            ProfileMismatch: friction, gravity or temperature is not that of the profile; both values are named.
-        """
+        """Compare it with the profile (``SafetyAbort``: not both ways; ``ProfileMismatch``: both values)."""
         position, velocity, torque = (
             (np.array(column) for column in zip(*self._rows, strict=True)) if self._rows else (np.empty(0),) * 3
         )

@@ -116,12 +116,7 @@ def run_in_own_process(
     drain: Callable[[], None],  # called every 50 ms to empty the rings
     care: Care,
 ) -> None:
-    """Run the scheduler in a child process; returns when it has ended.
-
-    Raises:
-        FrictidError: whatever ended the run in the child.
-        SafetyAbort: the child died without a word, or hangs and was ended.
-    """
+    """Run the scheduler in a child process to its end; raises what ended it, ``SafetyAbort`` if it died or hung."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     heard, wire = context.Pipe(duplex=False)

@@ -30,11 +30,7 @@ WAKE_TIME = Path("/dev/cpu_dma_latency")
 
 
 def make_punctual() -> list[str]:
-    """Ask for real-time scheduling, locked memory and awake processors, and switch garbage collection off.
-
-    This is for a process of its own: what it was given lasts until it ends. Returns what was not permitted, and the
-    remedy.
-    """
+    """Ask for real-time scheduling, locked memory, awake processors, no garbage collection; what was refused, why."""
     told = []
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
@@ -61,11 +57,8 @@ def make_punctual() -> list[str]:
 
 
 def _keep_processors_awake() -> bool:
-    """Allow no idle processor a sleep that takes time to wake from, for as long as this process lives.
-
-    The kernel's rule: the bound holds while the file is open. Source: Documentation/power/pm_qos_interface.rst. False
-    where it was not permitted; True also on a computer that has no such bound.
-    """
+    """No idle processor may sleep so that it takes time to wake, while this process lives; False: not permitted."""
+    # The bound holds while the file is open. Source: Documentation/power/pm_qos_interface.rst.
     try:
         kept_open = os.open(WAKE_TIME, os.O_WRONLY)
         os.write(kept_open, struct.pack("i", 0))
@@ -77,16 +70,11 @@ def _keep_processors_awake() -> bool:
 
 
 def move_to_isolated_cpu() -> int | None:
-    """Bind the calling thread to a processor that the kernel keeps free of other work (``isolcpus=``).
-
-    Nothing else of ours runs there: processes start on the others. What this thread starts from now on comes along.
-    Loops of several runs spread over the isolated processors by their process numbers. Returns its number; None where
-    none is isolated, or this process may use none of them.
-    """
+    """Bind this thread, and what it starts, to a processor that is free of other work (``isolcpus=``); None without."""
     isolated = [cpu for cpu in _numbers(_ISOLATED) if _allowed(cpu)]
     if not isolated:
         return None
-    cpu = isolated[os.getpid() % len(isolated)]
+    cpu = isolated[os.getpid() % len(isolated)]  # loops of several runs spread over them
     os.sched_setaffinity(0, {cpu})
     return cpu
 

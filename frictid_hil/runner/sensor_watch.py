@@ -79,10 +79,7 @@ class SensorWatch:
         self._at_rad, self._commanded_nm, self._beyond_ns = math.nan, (0.0, 0.0), 0
 
     def verdict(self, report: Feedback, most_rad_s: float, *, asked_rad: float = math.nan) -> str:
-        """Say in a sentence what is wrong with a new report; an empty string while all is well.
-
-        Where a position loop shall hold the joint at ``asked_rad``, its torque depends on the direction of motion.
-        """
+        """What is wrong with a new report, or "". A torque depends on the direction where a loop holds a joint."""
         t_ns, position, velocity = report.t_ns, report.position_rad, report.velocity_rad_s
         rows = self._rows
         if not rows:

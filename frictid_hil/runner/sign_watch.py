@@ -40,11 +40,7 @@ class SignWatch:
         return goes_on
 
     def judge(self) -> None:
-        """Judge the rehearsal. Friction is not judged where the joint moved in one direction only.
-
-        Raises:
-            SafetyAbort: torque helps motion, or position and velocity tell of different motions.
-        """
+        """Judge the rehearsal, friction if it went both ways (``SafetyAbort``: torque helps, or figures disagree)."""
         self._travelled.judge(self.joint)
         if not all(self._count):
             return

@@ -38,11 +38,7 @@ def handling_signals(handler: Callable[[int, FrameType | None], None]) -> Iterat
 
 
 class StopSignals:
-    """The level that signals have asked for so far.
-
-    A context manager; handlers are restored on leaving. Outside the main thread it only holds ``level``. A signal that
-    was ignored before (``nohup``) stays so.
-    """
+    """The level that signals have asked for; handlers hold inside of ``with``, in the main thread, if not ignored."""
 
     def __init__(self) -> None:
         self.level = NOTHING_ASKED
@@ -62,11 +58,7 @@ class StopSignals:
         self._previous.clear()
 
     def while_asking(self, question: Callable[[], Answer]) -> Answer:
-        """Return the answer to a question. A signal ends the question at once, because nothing moves yet.
-
-        Raises:
-            Interrupted: by a signal.
-        """
+        """The answer to a question, which a signal ends at once, because nothing moves yet (``Interrupted``)."""
         self._asking = True
         try:
             return question()

@@ -77,11 +77,7 @@ class Travelled:
         return min(max(self.by_position_rad, self._least_rad), self._most_rad)
 
     def judge(self, joint: str) -> None:
-        """Compare the two ways. A drive without velocity, or with too coarse a velocity, is not judged.
-
-        Raises:
-            SafetyAbort: position and velocity tell of different motions.
-        """
+        """Compare the ways, if the velocity is fine enough (``SafetyAbort``: they tell of different motions)."""
         travel_rad = self.by_position_rad
         if self._time_s <= 0.0 or travel_rad <= 0.0:
             return
@@ -120,11 +116,7 @@ class UnitProof:
         self._travelled = Travelled(period_s)
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
-        """Judge the report, then give the next set-point.
-
-        Raises:
-            SafetyAbort: the joint does not do what it was asked.
-        """
+        """Judge the report, then give the next set-point (``SafetyAbort``: the joint does not do what it was asked)."""
         before_rad = set_point.position_rad
         following = next(self._path, None)
         if following is None:
