@@ -50,6 +50,11 @@ def parse_quantity(text: str, dimension: str) -> float:
     return value
 
 
+def format_figure(value: float | None, form: str = ".4g", unit: str = "", unknown: str = "") -> str:
+    """A figure with its unit, or what is told where it is None."""
+    return unknown if value is None else f"{value:{form}} {unit}".rstrip()
+
+
 def degrees(angle_rad: float) -> float:
     """Radians to degrees."""
     return angle_rad / _DEG

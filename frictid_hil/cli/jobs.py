@@ -10,6 +10,7 @@ import typer
 from frictid_hil.cli import options as opt
 from frictid_hil.cli.options import option
 from frictid_hil.cli.output import Output, Result, folding, takes, verb
+from frictid_hil.units import format_figure
 
 app = typer.Typer()
 
@@ -23,19 +24,15 @@ def _show_night(output: Output, result: Result) -> None:
         table.add_row(
             name,
             verdict if gates == "ok" else gates,
-            _with_unit(figures["distance_percent"], "%"),
-            _with_unit(figures["distance_from_active_percent"], "%"),
-            _with_unit(figures["coulomb_nm"], "N m", digits=3),
-            _with_unit(figures["temperature_c"], "degC"),
+            format_figure(figures["distance_percent"], ".1f", "%"),
+            format_figure(figures["distance_from_active_percent"], ".1f", "%"),
+            format_figure(figures["coulomb_nm"], ".3f", "N m"),
+            format_figure(figures["temperature_c"], ".1f", "degC"),
         )
     output.err.print(table)
     # One line for whatever reads the log next morning.
     kept = ("outcome", "robot", "promoted", "active", "drifted", "reason", "next_step", "run", "recalibration_report")
     output.say(json.dumps({key: result.get(key) for key in kept}))
-
-
-def _with_unit(value: float | None, unit: str, digits: int = 1) -> str:
-    return "" if value is None else f"{value:.{digits}f} {unit}"
 
 
 @verb(app, "recalibrate", _show_night)

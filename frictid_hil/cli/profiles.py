@@ -11,7 +11,7 @@ from frictid_hil.cli import options as opt
 from frictid_hil.cli.options import argument, option
 from frictid_hil.cli.output import READING, Output, Result, folding, takes, verb
 from frictid_hil.plan.linear_axis import rotary_names
-from frictid_hil.units import degrees
+from frictid_hil.units import degrees, format_figure
 
 _SHOWN = 50  # profiles, promotions and nights in a table that a person reads
 
@@ -79,9 +79,9 @@ def _show_diff(output: Output, result: Result) -> None:
         (
             name,
             f"{figures['distance_percent']:.2f}",
-            _signed(figures["coulomb_change_percent"]),
+            format_figure(figures["coulomb_change_percent"], "+.1f"),
             "" if figures["overlap_share"] is None else f"{100 * figures['overlap_share']:.0f}",
-            _signed(figures["temperature_change_c"]),
+            format_figure(figures["temperature_change_c"], "+.1f"),
             "; ".join(f"{what}: {how}" for what, how in figures["other_changes"].items()),
         )
         for name, figures in result["joints"].items()
@@ -168,12 +168,9 @@ def _figures(joint: Result) -> tuple[str, str, str]:
     """F_0, distance from the baseline and temperature, with their units."""
     unit = "N" if "coulomb_n" in joint else "N m"
     joint = rotary_names(joint)
-    level, distance, temperature = joint["coulomb_nm"], joint["distance_percent"], joint["temperature_c"]
-    return (
-        "" if level is None else f"{level:.4g} {unit}",
-        "" if distance is None else f"{distance:.1f} %",
-        "" if temperature is None else f"{temperature:.0f} degC",
-    )
+    forms = ("coulomb_nm", ".4g", unit), ("distance_percent", ".1f", "%"), ("temperature_c", ".0f", "degC")
+    level, distance, temperature = (format_figure(joint[key], form, unit) for key, form, unit in forms)
+    return level, distance, temperature
 
 
 def _events(result: Result) -> list[str]:
@@ -187,10 +184,6 @@ def _events(result: Result) -> list[str]:
         if not one["promoted"]
     ]
     return sorted(events)
-
-
-def _signed(value: float | None) -> str:
-    return "" if value is None else f"{value:+.1f}"
 
 
 @verb(app, "history", _show_history, schema="profile_history")

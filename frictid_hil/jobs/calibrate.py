@@ -40,7 +40,7 @@ from frictid_hil.runner.events import JointRun, Preflight
 from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runs.folder import kept_joints, manifest_of
 from frictid_hil.runs.life import Ended, Order, Run
-from frictid_hil.runs.options import kept_options, restored
+from frictid_hil.runs.options import Options, kept_options, restored
 from frictid_hil.runs.rehearsals import Rehearsals
 from frictid_hil.units import format_velocity
 
@@ -49,11 +49,9 @@ _CONTINUED = (VERB, "recalibrate")
 
 
 @dataclass(frozen=True, slots=True)
-class CalibrateOptions:
+class CalibrateOptions(Options):
     """What a person asked for, see ``calibrate --help``; the rest is the robot file's, or of the run continued."""
 
-    robot: str = ""
-    bus: str | None = None
     joints: tuple[str, ...] = ()
     amplitude_rad: float | None = None
     velocity_rad_s: float | None = None
@@ -66,8 +64,6 @@ class CalibrateOptions:
     rate_hz: float | None = None
     realtime: bool | None = None
     seed: int | None = None
-    resume: Path | None = None
-    out: Path | None = None
     verb: str = VERB  # that the run is part of
     warm_up: WarmUpPolicy | None = None  # every joint is warmed up before it is measured
     interlock: Interlock | None = None  # must be closed before and during motion

@@ -49,19 +49,17 @@ from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.events import JointRun, Preflight
 from frictid_hil.runs.folder import manifest_of, parts_of
 from frictid_hil.runs.life import Ended, Order, Run
-from frictid_hil.runs.options import kept_options, restored
+from frictid_hil.runs.options import Options, kept_options, restored
 from frictid_hil.runs.rehearsals import Rehearsals
 
 VERB = "gap-record"
 
 
 @dataclass(frozen=True, slots=True)
-class GapRecordOptions:
-    """What a person asked for, see ``frictid-hil gap record --help``."""
+class GapRecordOptions(Options):
+    """What a person asked for, see ``gap record --help``; what a plan file asks for is added to the set in ``out``."""
 
-    robot: str = ""
     joint: str = ""
-    bus: str | None = None
     short: bool = False
     plan: Path | None = None  # plan file of a diagnosis that could not decide; overrules ``short``
     experiments: tuple[str, ...] = ()  # names of experiments; overrule ``plan``
@@ -71,9 +69,6 @@ class GapRecordOptions:
     centre_rad: float | None = None  # middle of all travels; None: middle of the joint's procedure
     realtime: bool = False
     seed: int = 0  # of simulated noise and of the validation moves
-    # Folder of the set; what a plan file asks for is added to the set of the same joint that is there.
-    out: Path | None = None
-    resume: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,11 +255,7 @@ def _travel(experiments: Sequence[Experiment]) -> tuple[float, float]:
 
 
 class _Recording:
-    """The plans on the hardware, one after the other, and the logs that come of them.
-
-    A lock-step robot runs them in one go, so that it stays as warm as a real one would; its payload is mounted between
-    two stretches of cyclic traffic. Everybody else is asked again before the plan with the payload.
-    """
+    """The plans on the hardware, one after the other, and the logs that come of them."""
 
     def __init__(self, options: GapRecordOptions, watcher: Watcher, *, move: bool) -> None:
         self._watcher = watcher
@@ -316,6 +307,7 @@ class _Recording:
         self._run, plans = run, self._plans
         if not plans:
             run.reopen()
+        # A lock-step robot stays as warm as a real one would: its payload is mounted between two stretches of traffic.
         for plan in [_joined(plans)] if plans and self.order.setup.lock_step else plans:
             try:
                 if not self._ready_for(plan):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 from frictid_hil.plan.plan import Plan
-from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.runner.events import Event, Preflight
-from frictid_hil.runner.ring import Rows
+from frictid_hil.runner.events import Preflight
 from frictid_hil.runs.life import Follower
 
 
@@ -16,22 +14,16 @@ class Watcher(Follower, Protocol):
 
     def ask(self, question: str) -> bool:
         """Ask whether a person has done what the question says; False where nobody can be asked."""
-        ...
 
     def joint(self, joint: str, summary: str, ok: bool) -> None:
         """A joint's result in a line."""
-        ...
 
     def note(self, message: str) -> None:
         """A line a person should see."""
-        ...
 
 
 class Silent:
     """Watches nothing and says yes; for scheduled jobs and tests."""
-
-    def plan(self, plan: Plan, setup: RobotSetup) -> None:
-        """Ignore it."""
 
     def confirm(self, plan: Plan, preflight: Preflight) -> bool:
         """Answer yes."""
@@ -41,14 +33,7 @@ class Silent:
         """Answer no, because nobody is there."""
         return False
 
-    def event(self, event: Event) -> None:
+    def note(self, *_: Any, **__: Any) -> None:
         """Ignore it."""
 
-    def rows(self, rows: Rows) -> None:
-        """Ignore it."""
-
-    def joint(self, joint: str, summary: str, ok: bool) -> None:
-        """Ignore it."""
-
-    def note(self, message: str) -> None:
-        """Ignore it."""
+    plan = event = rows = joint = note

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, REFERENCE, Figure, bars, line
 from frictid_hil.report.pages import Page, Section, Table
-from frictid_hil.units import degrees
+from frictid_hil.units import degrees, format_figure
 
 _COLORS = {"nc": "#b2477f", "mo": PUBLISHED, "mol": "#8a5fb0", "mop": IDENTIFIED, "mop-reference": REFERENCE}
 _SHOWN_CYCLES = 2.0
@@ -25,39 +25,26 @@ _NAMES = {
 }
 
 
-class Run(Protocol):
-    """One mode's samples, as a page needs them; every array of shape (n,)."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ModeRun:
+    """The samples of one mode: its whole cycles without the first one; columns of shape (n,)."""
 
-    @property
-    def time_s(self) -> Array:
-        """Since the beginning of the task."""
-
-    @property
-    def position_rad(self) -> Array:
-        """Measured."""
-
-    @property
-    def velocity_rad_s(self) -> Array:
-        """Measured."""
-
-    @property
-    def reference_rad(self) -> Array:
-        """Position on the planned path."""
-
-    @property
-    def torque_nm(self) -> Array:
-        """Of the drive."""
-
-    @property
-    def external_torque_nm(self) -> Array | None:
-        """Torque of the person who guides the joint."""
+    mode: str
+    time_s: Array  # since the beginning of the task
+    position_rad: Array
+    velocity_rad_s: Array
+    reference_rad: Array  # the path
+    torque_nm: Array
+    external_torque_nm: Array | None  # a person's; None without a force sensor
+    velocity_delay_s: float = 0.0  # by which the reported velocity is older than its row
+    cycles: int = 1  # of the task, each a repetition of the others
 
 
 def compensation_page(
     robot: str,
     joint: str,
     task: str,  # ``hand`` or ``track``
-    runs: Mapping[str, Run],  # samples by mode
+    runs: Mapping[str, ModeRun],  # samples by mode
     modes: Mapping[str, Mapping[str, Any]],  # figures by mode, as in the JSON of the verb
     *,
     facts: Mapping[str, str],  # provenance
@@ -101,7 +88,7 @@ def _table(modes: Mapping[str, Mapping[str, Any]], columns: Sequence[_Column], c
     return Table(("mode", *(heading for heading, _ in columns)), rows, f"{caption} {_INTERVAL}")
 
 
-def _by_hand(runs: Mapping[str, Run], modes: Mapping[str, Mapping[str, Any]]) -> tuple[Figure, ...]:
+def _by_hand(runs: Mapping[str, ModeRun], modes: Mapping[str, Mapping[str, Any]]) -> tuple[Figure, ...]:
     loops = [
         line(_short(mode), degrees(1.0) * run.velocity_rad_s, run.external_torque_nm, _color(mode), width=1)
         for mode, run in runs.items()
@@ -127,7 +114,10 @@ def _by_hand(runs: Mapping[str, Run], modes: Mapping[str, Mapping[str, Any]]) ->
     )
 
 
-def _following(runs: Mapping[str, Run], modes: Mapping[str, Mapping[str, Any]]) -> tuple[Figure, ...]:
+def _following(runs: Mapping[str, ModeRun], modes: Mapping[str, Mapping[str, Any]]) -> tuple[Figure, ...]:
+    def error(run: ModeRun) -> Array:
+        return np.asarray(deg * (run.reference_rad - run.position_rad))
+
     first = next(iter(runs.values()))
     shown, deg = _first_cycles(first), degrees(1.0)
     reference = line("reference", first.time_s[shown], deg * first.reference_rad[shown], MEASURED, dash="dot", width=1)
@@ -136,19 +126,15 @@ def _following(runs: Mapping[str, Run], modes: Mapping[str, Mapping[str, Any]]) 
     error_bars = bars("E_s", list(map(_short, modes)), values, IDENTIFIED)
     return (
         replace(position, traces=(reference, *position.traces)),
-        _over_time("Tracking error", "reference - position [deg]", runs, _error_deg, 1.5),
+        _over_time("Tracking error", "reference - position [deg]", runs, error, 1.5),
         _over_time("Velocity", "velocity [deg/s]", runs, lambda run: deg * run.velocity_rad_s),
         _over_time("Torque of the drive", "torque [N m]", runs, lambda run: run.torque_nm),
         Figure("Tracking error E_s (Fig. 14)", (error_bars,), "mode", "E_s [deg]"),
     )
 
 
-def _error_deg(run: Run) -> Array:
-    return np.asarray(degrees(1.0) * (run.reference_rad - run.position_rad))
-
-
 def _over_time(
-    title: str, y_title: str, runs: Mapping[str, Run], column: Callable[[Run], Array | None], width: float = 1
+    title: str, y_title: str, runs: Mapping[str, ModeRun], column: Callable[[ModeRun], Array | None], width: float = 1
 ) -> Figure:
     """One column of every mode over the first cycles."""
     traces = []
@@ -159,7 +145,7 @@ def _over_time(
     return Figure(title, tuple(traces), "time [s]", y_title)
 
 
-def _first_cycles(run: Run) -> slice:
+def _first_cycles(run: ModeRun) -> slice:
     """As much of a run as shows its shape: two seconds or so."""
     count = int((run.time_s < run.time_s[0] + _SHOWN_CYCLES * 1.5).sum())
     return slice(0, max(2, count))
@@ -182,24 +168,23 @@ def _between(interval: Sequence[float] | None, scale: float = 1.0, unit: str = "
     return "" if interval is None else f" ({interval[0] * scale:.4g} to {interval[1] * scale:.4g}{unit})"
 
 
-def _percent(value: float | None) -> str:
-    return "" if value is None else f"{value:.1f} %"
-
-
 _Column = tuple[str, Callable[[Mapping[str, Any]], str]]  # A heading, and what stands below it of a mode's figures
 _SPEED: _Column = ("speed V_s [deg/s]", lambda mode: _number(mode["velocity_rms_rad_s"], degrees(1.0)))
 _REDUCED: _Column = (
     "reduced by",
-    lambda mode: _percent(mode["reduction_percent"]) + _between(mode.get("reduction_interval_95_percent"), unit=" %"),
+    lambda mode: (
+        format_figure(mode["reduction_percent"], ".1f", "%")
+        + _between(mode.get("reduction_interval_95_percent"), unit=" %")
+    ),
 )
-_CEILING: _Column = ("ceiling", lambda mode: _percent(mode.get("ceiling_percent")))
+_CEILING: _Column = ("ceiling", lambda mode: format_figure(mode.get("ceiling_percent"), ".1f", "%"))
 _HAND: tuple[_Column, ...] = (
     _SPEED,
     ("hand torque F_s [N m]", lambda mode: _number(mode["torque_rms_nm"]) + _between(mode.get("interval_95"))),
     _REDUCED,
     _CEILING,
     ("F_s, inertia removed [N m]", lambda mode: _number(mode["torque_rms_inertia_removed_nm"])),
-    ("reduced by", lambda mode: _percent(mode["reduction_inertia_removed_percent"])),
+    ("reduced by", lambda mode: format_figure(mode["reduction_inertia_removed_percent"], ".1f", "%")),
 )
 _HAND_CAPTION = (
     "Root mean squares over the whole task. The ceiling is what a joint without any friction would reach, whose "

@@ -15,7 +15,7 @@ from frictid_hil.gap.where import by_region
 from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, Figure, band, bars, line
 from frictid_hil.report.pages import Page, Section, Table
 from frictid_hil.simulation.effect import Region
-from frictid_hil.units import degrees
+from frictid_hil.units import degrees, format_figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ def _causes(causes: tuple[Cause, ...]) -> Table:
             + ("" if value.low is None or value.high is None else f" ({value.low:.4g} .. {value.high:.4g})")
             for name, value in cause.parameters.items()
         ]
-        closed = "" if cause.gap_closed_percent is None else f"{cause.gap_closed_percent:.0f} %"
+        closed = format_figure(cause.gap_closed_percent, ".0f", "%")
         alike = ", ".join(cause.confusable_with)
         rows.append((cause.effect, f"{cause.confidence:.2f}", closed, "; ".join(parameters), alike))
     headings = ("effect", "confidence", "closes of the gap", "parameters (95 % interval)", "confusable with")
@@ -100,8 +100,9 @@ def _causes(causes: tuple[Cause, ...]) -> Table:
 
 
 def _how_far(found: Diagnosis) -> Table:
+    states = (found.before, found.after, found.noise_floor)
     rows = [
-        (name, *(_text(getattr(figures, key)) for figures in (found.before, found.after, found.noise_floor)))
+        (name, *(format_figure(getattr(state, key), unknown="cannot be formed") for state in states))
         for name, key in (
             ("inverse dynamics [N m]", "inverse_nm"),
             ("torque in closed loop [N m]", "forward_torque_nm"),
@@ -145,7 +146,3 @@ def _side_by_side(log: SideBySide) -> tuple[Figure, ...]:
         Figure(f"{log.log}: torque", tuple(torque), "time [s]", "torque [N m]"),
         Figure(f"{log.log}: position difference", tuple(error), "time [s]", "simulated - measured position [deg]"),
     )
-
-
-def _text(value: float | None) -> str:
-    return "cannot be formed" if value is None else f"{value:.4g}"

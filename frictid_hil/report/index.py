@@ -9,6 +9,7 @@ from frictid_hil.report.calendar import STATES, calendar, state_of
 from frictid_hil.report.pages import Link, Page, Section, Table
 from frictid_hil.report.trends import trend_figures
 from frictid_hil.report.words import sentence, when, with_interval
+from frictid_hil.units import format_figure
 
 _SHOWN = 60
 _DONE = {"promote": "promoted", "rollback": "rolled back to", "baseline": "made the baseline"}
@@ -37,13 +38,15 @@ def index_page(
     measured_from = "There is no baseline to measure from."
     if baseline:
         measured_from = f"Drift is measured from the baseline {baseline}."
+    # The policy's limit when the newest night began that tells it.
+    limit = next((n.drift_limit_percent for n in reversed(nights) if n.drift_limit_percent is not None), None)
     sections = [
         Section("Nights", calendar=calendar(nights, addresses)) if nights else None,
         Section(
             "Joints",
             words=(measured_from,),
             tables=(_joints(trends),),
-            figures=trend_figures(trends, drift_limit_percent=_limit(nights)),
+            figures=trend_figures(trends, drift_limit_percent=limit),
         ),
         Section("Recalibrations", tables=(_nights(nights, addresses),)) if nights else None,
         Section("Promotions", tables=(_promotions(promotions),)) if promotions else None,
@@ -51,11 +54,6 @@ def index_page(
     count = max((len(points) for points in trends.values()), default=0)
     facts = {"profiles kept": str(count), "recalibrations": str(len(nights)), "baseline": baseline or "none"}
     return Page(f"Friction history of {robot}", headline, [section for section in sections if section], facts)
-
-
-def _limit(nights: Sequence[Attempt]) -> float | None:
-    """The policy's limit of drift when the newest night began that tells it."""
-    return next((one.drift_limit_percent for one in reversed(nights) if one.drift_limit_percent is not None), None)
 
 
 def _word(outcome: str) -> str:
@@ -72,8 +70,8 @@ def _joints(trends: Mapping[str, Sequence[TrendPoint]]) -> Table:
                 ""
                 if last.coulomb_nm is None
                 else with_interval(last.coulomb_nm, last.coulomb_low_nm, last.coulomb_high_nm, "").strip(),
-                "" if last.distance_percent is None else f"{last.distance_percent:.1f}",
-                "" if last.temperature_c is None else f"{last.temperature_c:.1f}",
+                format_figure(last.distance_percent, ".1f"),
+                format_figure(last.temperature_c, ".1f"),
                 ", ".join(last.gates_failed).replace("_", " ") or "none",
                 when(points[-1].created_utc),
             )

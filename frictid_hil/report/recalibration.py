@@ -15,6 +15,7 @@ from frictid_hil.report.figures import IDENTIFIED, PUBLISHED, REFERENCE, Figure,
 from frictid_hil.report.pages import Page, Section, Table
 from frictid_hil.report.trends import trend_figures
 from frictid_hil.report.words import change, estimate, sentence, when
+from frictid_hil.units import format_figure
 
 _REFERENCE = {"baseline": "baseline", "active": "active profile"}
 
@@ -85,10 +86,10 @@ def _drift(result: Mapping[str, Any], newer: FrictionProfile) -> Table:
                 name,
                 estimate(joint.coulomb_nm, "N" if joint.prismatic else "N m"),
                 change(figures["coulomb_change_percent"]),
-                _number(figures["distance_percent"]),
+                format_figure(figures["distance_percent"], ".1f"),
                 "" if share is None else f"{100 * share:.0f}",
-                _number(figures["distance_from_active_percent"]),
-                _number(figures["temperature_c"]),
+                format_figure(figures["distance_from_active_percent"], ".1f"),
+                format_figure(figures["temperature_c"], ".1f"),
                 change(figures["temperature_change_c"]),
                 "; ".join(f"{what}: {how}" for what, how in figures["other_changes"].items()),
             )
@@ -126,7 +127,3 @@ def _curves(name: str, joint: JointProfile, active: FrictionProfile | None, base
         pairs_of(joint),
     ]
     return over_speed(f"Joint {name}", joint, traces, "Bars are 95 % intervals.")
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.1f}"

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import MISSING, fields, replace
+from dataclasses import KW_ONLY, MISSING, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -16,22 +16,15 @@ _ELSEWHERE = frozenset({"robot", "resume", "out", "store", "verb"})
 """Options that are not kept, because the manifest has them elsewhere or because they change no measurement."""
 
 
-class Options(Protocol):
-    """A frozen dataclass of what a person asked for; a value that is the field's default was not asked for."""
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What a person asked for; a value that is the field's default was not asked for."""
 
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def robot(self) -> str:
-        """Robot file; "" where a run that is continued knows it."""
-
-    @property
-    def resume(self) -> Path | None:
-        """Run folder to continue."""
-
-    @property
-    def out(self) -> Path | None:
-        """Folder to write."""
+    robot: str = ""  # robot file; "" where a run that is continued knows it
+    _: KW_ONLY
+    bus: str | None = None
+    resume: Path | None = None  # run folder to continue
+    out: Path | None = None  # folder to write
 
 
 Asked = TypeVar("Asked", bound=Options)
@@ -44,7 +37,7 @@ def kept_options(options: Options) -> dict[str, Any]:
 
 
 def restored(options: Asked, verbs: Collection[str]) -> Asked:
-    """The options that a run of these verbs began with, if there is one (``UsageError``: no robot, or others now)."""
+    """The options that a run began with, where one is continued (``UsageError``: another verb's, or they differ)."""
     run = options.resume
     if run is None:
         if not options.robot:

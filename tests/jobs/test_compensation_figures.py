@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.jobs.compensation.figures import ModeRun, figures, friction_dominates, tracking_floor_rad
+from frictid_hil.jobs.compensation.figures import figures, friction_dominates, tracking_floor_rad
 from frictid_hil.jobs.compensation.plan import triangle
 from frictid_hil.plan.control import PositionGains
+from frictid_hil.report.compensation import ModeRun
 
 INERTIA, STEP = 0.5, 1e-3
 OMEGA, REACH = math.pi, math.radians(20)

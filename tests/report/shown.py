@@ -7,7 +7,6 @@ import json
 import re
 import shutil
 import subprocess
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile, JudgedGate, ProcedureUsed
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Value, Where
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.profiles import missing_torque
@@ -29,7 +27,7 @@ from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.report.arm import JointRun, arm_page
 from frictid_hil.report.calibration import calibration_page
-from frictid_hil.report.compensation import compensation_page
+from frictid_hil.report.compensation import ModeRun, compensation_page
 from frictid_hil.report.gap import SideBySide, gap_page
 from frictid_hil.report.index import index_page
 from frictid_hil.report.pages import Page
@@ -161,24 +159,18 @@ def an_arm_page() -> Page:
     return arm_page("arm <1>", "1 of 2 joints are as the model says.", found, {"pan": "pan.html"}, ("Note.",), runs)
 
 
-@dataclass(frozen=True)
-class ModeRun:
-    """One mode of compensation, as a page needs it."""
-
-    time_s: Array
-    position_rad: Array
-    velocity_rad_s: Array
-    reference_rad: Array
-    torque_nm: Array
-    external_torque_nm: Array | None
-
-
 def compensated(task: str, *, force_sensor: bool = True) -> Page:
     time_s = np.arange(0.0, 4.0, 0.01)
     wave = 0.2 * np.sin(2 * np.pi * time_s / 4)
     runs = {
         mode: ModeRun(
-            time_s, scale * wave, scale * np.gradient(wave, time_s), wave, 5 * wave, 8 * wave if force_sensor else None
+            mode,
+            time_s,
+            scale * wave,
+            scale * np.gradient(wave, time_s),
+            wave,
+            5 * wave,
+            8 * wave if force_sensor else None,
         )
         for mode, scale in (("nc", 0.7), ("mop", 0.98))
     }

@@ -20,26 +20,12 @@ from frictid_hil.jobs.identification.cycles import declared_skew
 from frictid_hil.plan.control import Compensated, PositionGains
 from frictid_hil.plan.plan import Motion
 from frictid_hil.recording.samples import Mark, Samples
+from frictid_hil.report.compensation import ModeRun
 
 DOMINATED_PERCENT = 85.0
 """Friction dominates a tracking error where giving it back exactly would take away this much of it."""
 
 _WIDTH_S = 0.004  # of the smoothing that is common to acceleration and torque: half power at 33 Hz
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ModeRun:
-    """The samples of one mode: its whole cycles without the first one; columns of shape (n,)."""
-
-    mode: str
-    time_s: Array  # since the beginning of the task
-    position_rad: Array
-    velocity_rad_s: Array
-    reference_rad: Array  # the path
-    torque_nm: Array
-    external_torque_nm: Array | None  # a person's; None without a force sensor
-    velocity_delay_s: float = 0.0  # by which the reported velocity is older than its row
-    cycles: int = 1  # of the task, each a repetition of the others
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,6 @@ from frictid_hil.errors import FrictidError
 from frictid_hil.jobs.compensation.figures import (
     DOMINATED_PERCENT,
     ModeFigures,
-    ModeRun,
     figures,
     following_lag_s,
     friction_dominates,
@@ -23,7 +22,7 @@ from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.plan.control import Compensated
 from frictid_hil.plan.mode import Mode
 from frictid_hil.recording.samples import Mark
-from frictid_hil.report.compensation import compensation_page
+from frictid_hil.report.compensation import ModeRun, compensation_page
 from frictid_hil.report.pages import write_page
 from frictid_hil.report.words import plain
 from frictid_hil.runner.events import JointRun
