@@ -73,21 +73,11 @@ class Drive(ABC):
 
     @abstractmethod
     def upload(self, index: int, sub: int) -> bytes:
-        """The bytes of an object.
-
-        Raises:
-            Aborted: the drive says no.
-            HardwareError: no answer.
-        """
+        """The bytes of an object; ``Aborted`` where the drive says no, ``HardwareError`` where it does not answer."""
 
     @abstractmethod
     def download(self, index: int, sub: int, data: bytes) -> None:
-        """Give an object its bytes.
-
-        Raises:
-            Aborted: the drive says no.
-            HardwareError: no answer.
-        """
+        """Give an object its bytes; raises as ``upload`` does."""
 
     @abstractmethod
     def answering_within(self, timeout_s: float) -> contextlib.AbstractContextManager[None]:
@@ -104,11 +94,7 @@ class Drive(ABC):
         return f"joint {self.joint} (node {self.node_id}), object {address}"
 
     def read(self, item: Object) -> int:
-        """Value of an object that must be there.
-
-        Raises:
-            HardwareError: absent, or no answer.
-        """
+        """Value of an object that must be there; ``HardwareError`` where it is absent, or no answer comes."""
         value = self.find(item)
         if value is None:
             raise HardwareError(
@@ -120,11 +106,7 @@ class Drive(ABC):
         return value
 
     def find(self, item: Object) -> int | None:
-        """Value of an object, None where the drive does not have it.
-
-        Raises:
-            HardwareError: no answer, or refused for another reason.
-        """
+        """Value of an object, None where it is absent; ``HardwareError`` without an answer, or refused otherwise."""
         data = self._upload(item.index, item.sub, item.address)
         if data is None:
             return None
@@ -159,11 +141,7 @@ class Drive(ABC):
         return self._confirmed[key]
 
     def apply(self, writes: Iterable[Write]) -> list[str]:
-        """Bring every setting about that is not yet so, in order; returns what the run goes on without, in words.
-
-        Raises:
-            RefusedByDrive: a drive does not take what the run cannot go on without.
-        """
+        """Bring about what is not yet so, in order; what the run goes on without, in words, or ``RefusedByDrive``."""
         said = []
         for write in writes:
             refused: RefusedByDrive | None = None
@@ -186,10 +164,7 @@ class Drive(ABC):
         return said
 
     def foresee(self, writes: Iterable[Write]) -> tuple[list[str], list[str]]:
-        """What ``apply`` would say of the same settings, by reading alone: what it would raise, what it would return.
-
-        What a drive will refuse shows in no object; it is foreseen where a quirk or an EDS file tells.
-        """
+        """What ``apply`` would raise and return, by reading alone: quirks and EDS files tell what will be refused."""
         fatal: list[str] = []
         lost: list[str] = []
         for write in writes:
@@ -226,22 +201,14 @@ class Drive(ABC):
         self.quirks = replace(self.quirks, types={**self.quirks.types, (item.index, item.sub): kind})
 
     def restore(self) -> None:
-        """Undo every write of this run, the last one first; what a drive does not take back stays.
-
-        Raises:
-            HardwareError: the drive no longer answers.
-        """
+        """Undo this run's writes, the last first; what is not taken back stays. ``HardwareError`` without an answer."""
         before, self._before = self._before, []
         for item, value in reversed(before):
             with contextlib.suppress(RefusedByDrive):
                 self.write_blind(item, value)
 
     def write(self, item: Object, value: int, mask: int = -1) -> None:
-        """Write and read back, unless this very value was confirmed before; only the bits of ``mask`` must read back.
-
-        Raises:
-            HardwareError: refused, or another value is read back.
-        """
+        """Write and read back what is not confirmed yet; ``HardwareError`` where refused, or ``mask`` differs."""
         before = self.known(item)
         if before == value:
             return
@@ -257,11 +224,7 @@ class Drive(ABC):
         self._confirmed[item.index, item.sub] = value
 
     def write_blind(self, item: Object, value: int) -> None:
-        """Write without reading back (objects that change by themselves).
-
-        Raises:
-            HardwareError: refused.
-        """
+        """Write without reading back (objects that change by themselves); ``HardwareError`` where refused."""
         self._confirmed.pop((item.index, item.sub), None)
         item = self.quirks.typed(item)
         if not item.type.low <= value <= item.type.high:

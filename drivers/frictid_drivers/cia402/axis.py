@@ -138,11 +138,7 @@ class Axis:
         return abs(self.feedback.velocity_rad_s) <= self._standstill_rad_s
 
     def command(self, set_point: SetPoint, actual_units: int, *, healthy: bool) -> None:
-        """Fill both command frames for the coming cycle; no power is asked for while the drive is not ``healthy``.
-
-        Raises:
-            SafetyAbort: the set-point is not a finite number.
-        """
+        """Fill the coming cycle's frames, without power unless ``healthy``; ``SafetyAbort`` for what is no number."""
         if self._following_status == self.feedback.status_raw and self._goes_on(set_point):
             return
         shown = self.feedback.mode

@@ -98,11 +98,7 @@ def bus_load(
 
 
 def highest_rate_hz(load_at: Callable[[float], BusLoad], start_hz: float) -> float:
-    """The highest whole rate that fits, at most ``start_hz``; 0 where none does.
-
-    The layout itself depends on the rate (decimated frames keep their interval in time), so the rate is approached
-    from above until the load fits.
-    """
+    """The highest whole rate up to ``start_hz`` that fits, 0 for none; from above, since the layout depends on it."""
     rate_hz = float(int(start_hz))
     while rate_hz >= 1.0:
         load = load_at(rate_hz)

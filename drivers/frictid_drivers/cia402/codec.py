@@ -29,10 +29,7 @@ _LIMIT_ACTIVE = 0x0800  # statusword bit 11: a set-point or the torque is cut by
 
 
 def packing(types: Sequence[IntegerType]) -> struct.Struct | BitPacking:
-    """Integers into the bytes of a PDO and back: without gaps, least significant bit first.
-
-    Layouts of whole 8, 16, 32 or 64-bit entries (all that drives use in practice) compile to ``struct``.
-    """
+    """Integers into the bytes of a PDO and back, least significant bit first; whole widths compile to ``struct``."""
     codes = [kind.code for kind in types]
     return BitPacking(types) if None in codes else struct.Struct("<" + "".join(filter(None, codes)))
 
@@ -123,10 +120,7 @@ class _Joint:
     untold: int = 0
 
     def judge(self) -> None:
-        """What is wrong now: an emergency that was not taken back, or 603F in the state of fault.
-
-        603F beside a healthy statusword is history: at some vendors it is "the cause of the last interruption".
-        """
+        """What is wrong now: an emergency not taken back, or 603F in fault (else it is history, at some vendors)."""
         feedback = self.feedback
         feedback.error_code = self.emergency or (self.told if feedback.state is JointState.FAULT else 0)
 
@@ -279,10 +273,7 @@ class Decoder:
 
 
 class Command:
-    """One PDO that the host sends: named integers in, the same bytes buffer out, every cycle.
-
-    Values outside their type are cut to its bounds; the joint-side limits were applied before.
-    """
+    """One PDO that the host sends: named integers in, cut to the bounds of their type, the same bytes buffer out."""
 
     __slots__ = ("_at", "_bounds", "_pack", "_values", "cob_id", "data")
 
@@ -317,11 +308,7 @@ class Command:
 
 
 class CommandDecoder:
-    """Set-points out of the host's own frames, for replay.
-
-    ``position_rad``, ``velocity_rad_s``, ``torque_nm`` and ``torque_offset_nm`` hold the last commanded figure of each
-    joint, NaN before the first.
-    """
+    """Set-points out of the host's own frames, for replay: the last commanded of each joint, NaN before the first."""
 
     def __init__(self, frame_map: FrameMap) -> None:
         self._count = len(frame_map.joints)

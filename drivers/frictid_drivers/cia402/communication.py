@@ -58,11 +58,7 @@ def _free_consumer(drive: Drive, host_node: int) -> od.Object:
 
 
 def frame_format_writes(drive: Drive, switch: od.Object | None, *, fd: bool) -> list[Write]:
-    """Classical or CAN FD frames for the PDOs, where the robot file or a known drive has an object that decides it.
-
-    Raises:
-        HardwareError: CAN FD is wanted of a drive that lacks the object.
-    """
+    """Classical or CAN FD frames, where an object decides it; ``HardwareError`` where CAN FD is wanted without one."""
     if switch is None:
         return []  # the vendor's tool has set it; what comes in other frames is told while cycling
     if drive.has(switch):
@@ -124,11 +120,7 @@ def frame_of(drive: Drive, pdo: Pdo) -> Frame:
 
 
 def lesson(drive: Drive, refused: RefusedByDrive) -> bool:
-    """Learn from this drive's refusal of a nice-to-have: True where the layout can be planned again without it.
-
-    An object that cannot be mapped is left out where it can be; a drive that takes few transmission types reports on
-    every SYNC.
-    """
+    """Learn from this drive's refusal of a PDO's type or mapping: True where the layout can be planned without it."""
     item, quirks = refused.item, drive.quirks
     if item is None or refused.where != drive.where(item.address):
         return False

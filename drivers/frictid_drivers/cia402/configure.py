@@ -41,11 +41,7 @@ NEEDED = {
 
 
 def refuse_if_powered(drive: Drive) -> None:
-    """A drive that somebody else has enabled is not touched.
-
-    Raises:
-        HardwareError: its power stage is on.
-    """
+    """``HardwareError`` where somebody else has enabled the drive: it is not touched."""
     if drive_state(drive.read(od.STATUSWORD)) is DriveState.ENABLED:
         raise HardwareError(
             "the power stage is already on",
@@ -56,11 +52,7 @@ def refuse_if_powered(drive: Drive) -> None:
 
 
 def refuse_if_lacking(drive: Drive) -> None:
-    """A drive without these objects cannot be used.
-
-    Raises:
-        HardwareError: naming the first that is missing.
-    """
+    """``HardwareError`` naming the first object that is missing, without which a drive cannot be used."""
     for item, why in NEEDED.items():
         if not drive.has(item):
             raise HardwareError(
@@ -71,11 +63,7 @@ def refuse_if_lacking(drive: Drive) -> None:
 
 
 def end_quick_stop(drive: Drive) -> None:
-    """Switch off a drive that its watchdog stopped when an earlier run was cut off: it stands and holds until told.
-
-    Raises:
-        HardwareError: it stays in quick stop.
-    """
+    """Switch off a drive that its watchdog stopped when a run was cut off; ``HardwareError`` where it holds on."""
     if drive_state(drive.read(od.STATUSWORD)) is not DriveState.QUICK_STOP_ACTIVE:
         return
     drive.write_blind(od.CONTROLWORD, DISABLE_VOLTAGE)
@@ -133,10 +121,7 @@ def interpolation_writes(drive: Drive, cycle_hz: float) -> list[Write]:
 
 
 def interpolation_period(drive: Drive, cycle_hz: float) -> tuple[int, int]:
-    """60C2 for a rate: value (1..255) and power of ten.
-
-    Milliseconds come first where the period is whole in them: some drives take no other power of ten.
-    """
+    """60C2 for a rate, value (1..255) and power of ten: milliseconds first, because some drives take no other power."""
     own = drive.known(od.INTERPOLATION_INDEX)
     closest = (math.inf, 1, -3)
     for index in (-3,) if own is None else (-3, own, -4, -5, -6, -2, -1):
@@ -151,11 +136,7 @@ def interpolation_period(drive: Drive, cycle_hz: float) -> tuple[int, int]:
 
 
 def refuse_other_period(drive: Drive, cycle_hz: float, lost: Iterable[str]) -> None:
-    """What the drive takes as interpolation time, or will take but for what it did not take, must be our period.
-
-    Raises:
-        HardwareError: it interpolates over another time.
-    """
+    """``HardwareError`` where the drive's interpolation time, after all but what is ``lost``, is not our period."""
     if not drive.has(od.INTERPOLATION_VALUE):
         return
     as_it_is = any("interpolation time" in one for one in lost)
@@ -212,11 +193,8 @@ def limit_writes(
 ) -> tuple[list[Write], list[str]]:
     """The drive's own limits: 6072 in per mille, 607D in position units (which of them is lower depends on direction).
 
-    A limit that is tighter in the drive than asked for stays, unless the robot file says that it may be loosened; what
-    stays so is returned in words beside the writes.
-
-    Raises:
-        HardwareError: the limits are no span of whole units.
+    A limit that is tighter in the drive stays, unless the robot file says that it may be loosened; what stays so is
+    returned in words beside the writes. ``HardwareError`` where the limits are no span of whole units.
     """
     writes, tighter = [], []
     torque = drive.known(od.MAX_TORQUE)

@@ -56,16 +56,10 @@ _OFF = (DriveState.SWITCH_ON_DISABLED, DriveState.NOT_READY, DriveState.FAULT, D
 
 
 class Cia402Driver:
-    """A robot of CiA-402 drives on one CAN bus.
+    """A robot of CiA-402 drives on one CAN bus; ``InvalidFields`` for a wrong option or node id of the robot file.
 
-    Args:
-        setup: the robot; ``settings`` lists the options it may carry.
-        bus_factory: opens the bus instead of python-can (a simulated one); it is then not locked.
-        clock: run time; a lock-step clock promises that answers are there when ``send`` returns, and that time passes
-            only in its ``wait_until``.
-
-    Raises:
-        InvalidFields: an option or node id of the robot file is wrong.
+    ``bus_factory`` opens the bus instead of python-can (a simulated one); it is then not locked. A lock-step clock
+    promises that answers are there when ``send`` returns, and that time passes only in its ``wait_until``.
     """
 
     kind = DriverKind(addressed_by="node", addresses=(1, 127), elsewhere={"virtual": "virtual", "serial": "motoman"})
@@ -91,12 +85,7 @@ class Cia402Driver:
     # -- reaching the drives ------------------------------------------------------------------------------------
 
     def open(self, frame_sink: FrameSink | None = None) -> None:
-        """Take the bus exclusively and hear from every drive; reads only.
-
-        Raises:
-            HardwareBusy: another process holds the bus.
-            HardwareError: no such bus, or a drive does not answer.
-        """
+        """Take the bus exclusively and hear from every drive; reads only."""
         self._sink = frame_sink
         try:
             if self._bus_factory is None:
@@ -162,11 +151,7 @@ class Cia402Driver:
         return [fault for drive in self._reached().drives.values() if (fault := reentry.standing_fault(drive))]
 
     def reset_faults(self) -> None:
-        """Bring them back, without power: reset of communication, then of the fault.
-
-        Raises:
-            HardwareError: a drive has power, does not come back, or stays in fault.
-        """
+        """Reset of communication, then of the fault, without power; ``HardwareError`` where one does not come back."""
         fleet = self._reached()
         for drive in fleet.drives.values():
             if reentry.standing_fault(drive) is not None:
@@ -177,9 +162,7 @@ class Cia402Driver:
     def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
         """Write and read back everything for this rate; ``active`` joints report on every SYNC.
 
-        Raises:
-            PlanRefused: the layout does not fit the bus; the message has the numbers and the highest rate that does.
-            HardwareError: a drive refuses or does not confirm a setting, or is not what the robot file says.
+        ``PlanRefused``, with the numbers and the highest rate that fits, where the layout does not fit the bus.
         """
         fleet = self._reached()
         if self._cycle is not None:
@@ -203,13 +186,7 @@ class Cia402Driver:
         return [Finding(Severity.WARNING, f"joint {joint}", said) for joint, all_ in notes.items() for said in all_]
 
     def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
-        """Torque and position limits in the drive, read back (6072, 607D), and the torque limit in the host.
-
-        A limit that is tighter in the drive stays, unless the joint's options say otherwise.
-
-        Raises:
-            HardwareError: refused or not confirmed.
-        """
+        """Limits in the drive, read back (6072, 607D), and of torque in the host; tighter ones stay unless allowed."""
         fleet, name = self._reached(), self.setup.joint(joint).name
         drive, settings = fleet.drives[name], self._joint_settings[name]
         limits = (torque_nm, position_min_rad, position_max_rad)
@@ -219,11 +196,7 @@ class Cia402Driver:
         self._axis_of(name).limit_torque(torque_nm)
 
     def frame_map(self) -> FrameMap:
-        """Which frame carries what, as read back; for the run's manifest and for replay.
-
-        Raises:
-            HardwareError: not configured yet.
-        """
+        """Which frame carries what, as read back; for manifest and replay. ``HardwareError`` before ``configure``."""
         if self._frame_map is None:
             raise HardwareError("frame_map before configure")
         return self._frame_map
@@ -235,11 +208,7 @@ class Cia402Driver:
     # -- cycling ------------------------------------------------------------------------------------------------
 
     def start_cycling(self) -> None:
-        """All drives operational, run time zero. No SDO from here on, and no thread but the caller's.
-
-        Raises:
-            HardwareError: not configured.
-        """
+        """All drives operational, run time zero. No SDO from here on, and no thread but the caller's."""
         fleet = self._reached()
         if self._layout is None or self._frame_map is None or self._decoder is None or self._bus is None:
             raise HardwareError("start_cycling before configure")
@@ -265,8 +234,7 @@ class Cia402Driver:
     def enable(self, joint: str, mode: Mode) -> None:
         """Ask for power; a fault that stands now is reset once. Progress is in the feedback.
 
-        Raises:
-            HardwareError: the drive lacks this mode, or has no watchdog for torque mode.
+        ``HardwareError`` where the drive lacks this mode, or has no watchdog for torque mode.
         """
         axis, facts = self._axis_of(joint), self._reached().facts[joint]
         where = f"joint {joint} (node {self.setup.joint(joint).address})"
@@ -308,11 +276,10 @@ class Cia402Driver:
             cycle.quick_stop()
 
     def stop_cycling(self) -> None:
-        """Bring every joint to standstill and power off, then end cyclic traffic.
+        """Bring every joint to standstill and power off, then end cyclic traffic: pre-operational, whatever happens.
 
-        Raises:
-            SafetyAbort: a joint did not come to rest; its voltage was disabled. ``may_be_powered`` names those that
-                were not seen to obey. The drives are pre-operational all the same.
+        ``SafetyAbort`` where a joint did not come to rest; its voltage was disabled. ``may_be_powered`` names those
+        that were not seen to obey.
         """
         cycle = self._cycle
         if cycle is None:

@@ -51,9 +51,7 @@ class _File:
 def frame_map_from_eds(path: Path, setup: RobotSetup) -> FrameMap:
     """The frames of a robot whose drives all have the mapping of one EDS or DCF file.
 
-    Raises:
-        InputFileError: not readable, or it maps no position.
-        HardwareError: its figures contradict the robot file.
+    ``InputFileError`` where it cannot be read or maps no position, ``HardwareError`` where the robot file contradicts.
     """
     _, options = read_settings(setup)
     joints = []

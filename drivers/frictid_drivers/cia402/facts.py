@@ -68,11 +68,7 @@ class Source(Protocol):
 
 
 def read_facts(drive: Source, quirks_of: Callable[[int, int, int], Quirks] | None = None) -> Facts:
-    """Ask the drive, and what is known of its vendor, product and revision; about forty uploads, no download.
-
-    Raises:
-        HardwareError: no answer.
-    """
+    """Ask the drive, and what is known of its kind; forty uploads, no download. ``HardwareError`` without an answer."""
 
     def pair(first: od.Object, second: od.Object) -> tuple[int, int] | None:
         a, b = drive.find(first), drive.find(second)

@@ -32,11 +32,7 @@ _HIGHEST_RATE_HZ = 4000.0
 
 
 class Fleet:
-    """The drives of one robot, reached; reads only until ``configure``.
-
-    Raises:
-        HardwareError: a drive does not answer, or is no CANopen device.
-    """
+    """The drives of one robot, reached; reads only until ``configure``. ``HardwareError`` where one does not answer."""
 
     def __init__(
         self,
@@ -146,17 +142,11 @@ class Fleet:
     # -- writing ------------------------------------------------------------------------------------------------
 
     def configure(self, active: Sequence[str], cycle_hz: float) -> tuple[Layout, FrameMap]:
-        """Write a layout and everything that makes it safe to all drives.
+        """Write a layout and all that makes it safe to every drive; returns it, and its frames as read back.
 
-        A drive that does not take what is nice to have is asked again without it.
-
-        Returns:
-            The layout, and its frames as read back.
-
-        Raises:
-            PlanRefused: the layout does not fit the bus.
-            HardwareError: a power stage is on, a setting is refused or not confirmed, or a drive is not what the robot
-                file says.
+        A drive that does not take what is nice to have is asked again without it. ``PlanRefused`` where the layout
+        does not fit the bus; ``HardwareError`` where a power stage is on, a setting is refused or not confirmed, or a
+        drive is not what the robot file says.
         """
         self._refuse_overload(self.load(active, cycle_hz), active)
         for drive in self.drives.values():
@@ -220,21 +210,14 @@ class Fleet:
         return first, last
 
     def restore(self, but_not: Collection[str]) -> None:
-        """Put back what this run changed, drive by drive; one that no longer answers is left alone.
-
-        The drives of joints that may still have power (``but_not``) go on watching over us.
-        """
+        """Put back what this run changed where a drive answers; where power may be on (``but_not``) drives watch on."""
         for name, drive in self.drives.items():
             if name not in but_not:
                 with contextlib.suppress(HardwareError):
                     drive.restore()
 
     def scale_of(self, joint: str) -> Scale:
-        """Joint-side factors.
-
-        Raises:
-            HardwareError: not configured yet.
-        """
+        """Joint-side factors; ``HardwareError`` where not configured yet."""
         if joint not in self._scales:
             raise HardwareError("not configured yet", where=f"joint {joint}")
         return self._scales[joint]

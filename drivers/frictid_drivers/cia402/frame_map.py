@@ -109,11 +109,7 @@ class FrameMap:
 
     @staticmethod
     def from_mapping(mapping: Mapping[str, Any]) -> FrameMap:
-        """Read plain values, from a manifest or written by hand.
-
-        Raises:
-            InvalidFields: every field that is wrong, with its path.
-        """
+        """Read plain values, from a manifest or written by hand; ``InvalidFields`` with every field that is wrong."""
         return _Reader().frame_map(mapping)
 
 

@@ -126,11 +126,7 @@ def _name(can_id: int) -> str:
 
 
 def decoder(frame_map: Mapping[str, Any]) -> LogDecoder:
-    """A decoder for logs with this frame map.
-
-    Raises:
-        InvalidFields: every field of the map that is wrong.
-    """
+    """A decoder for logs with this frame map; ``InvalidFields`` with every field of the map that is wrong."""
     return LogDecoder(FrameMap.from_mapping(frame_map))
 
 

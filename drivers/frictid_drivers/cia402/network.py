@@ -45,11 +45,7 @@ class Wire(canopen.Network):
         self._sink_lock = threading.RLock()
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Send one frame (canopen's own way out).
-
-        Raises:
-            InterfaceFailed: now.
-        """
+        """Send one frame (canopen's own way out); ``InterfaceFailed`` where it cannot."""
         message = can.Message(arbitration_id=can_id, is_extended_id=False, data=bytes(data), is_remote_frame=remote)
         with self.send_lock:
             self._tell(can_id, message.data, True)
@@ -57,11 +53,7 @@ class Wire(canopen.Network):
                 self._wire.send(message)
 
     def pump(self, timeout_s: float) -> bool:
-        """Receive at most one frame and hand it to its subscribers; False when none came in time.
-
-        Raises:
-            InterfaceFailed: now.
-        """
+        """Hand at most one frame to its subscribers; False where none came in time, ``InterfaceFailed`` on errors."""
         with _working("receive"):
             message = self._wire.recv(timeout_s)
         if message is None:

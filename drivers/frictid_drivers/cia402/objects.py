@@ -22,11 +22,7 @@ class IntegerType:
 
     @staticmethod
     def parse(text: str) -> IntegerType:
-        """``"i16"`` to a type.
-
-        Raises:
-            ValueError: not ``i`` or ``u`` with 1 to 64 bits.
-        """
+        """``"i16"`` to a type; ``ValueError`` where it is not ``i`` or ``u`` with 1 to 64 bits."""
         match = _BITS.match(text)
         if match is None:
             raise ValueError(f"{text!r} is not an integer type; expected i or u with 1..64 bits, e.g. i32, u16")
@@ -55,11 +51,7 @@ class IntegerType:
         return value.to_bytes(self.bits // 8, "little", signed=self.signed)
 
     def unpack(self, data: bytes) -> int:
-        """Value of little-endian bytes; some drives send more bytes than the object has, these are cut off.
-
-        Raises:
-            struct.error: too few bytes.
-        """
+        """Value of little-endian bytes; what some drives send beyond it is cut off. ``struct.error`` for too few."""
         size = self.bits // 8
         if len(data) < size:
             raise struct.error(f"{len(data)} bytes for {self}")
@@ -232,11 +224,7 @@ class Entry:
 
     @staticmethod
     def parse(text: str) -> Entry:
-        """``"6064:00 i32"`` or ``"2401:00 i16 external_torque"``.
-
-        Raises:
-            ValueError: not of that form, or an unknown meaning.
-        """
+        """``"6064:00 i32"`` or ``"2401:00 i16 external_torque"``; ``ValueError`` for another form or meaning."""
         match = _ENTRY.match(text)
         if match is None:
             raise ValueError(f"{text!r} is not of the form '6064:00 i32' or '2401:00 i16 external_torque'")

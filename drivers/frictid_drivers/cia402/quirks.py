@@ -104,11 +104,7 @@ NO_QUIRKS = Quirks()
 
 
 class Catalogue:
-    """All entries of the shipped file, and of one beside the robot file.
-
-    Raises:
-        InputFileError: a file that is not of this form; the message names it and the entry.
-    """
+    """All entries of the shipped file, and of one beside the robot file; ``InputFileError`` names file and entry."""
 
     def __init__(self, folder: Path | None = None) -> None:
         files = [SHIPPED] + ([own] if folder and (own := folder / "quirks.yaml").is_file() else [])
@@ -185,11 +181,7 @@ def _entry(path: Path, number: int, plain: Any) -> tuple[dict[str, int], Quirks]
 
 
 def address(text: str) -> Address:
-    """``"60C2:02"`` to index and sub-index.
-
-    Raises:
-        ValueError: not of that form.
-    """
+    """``"60C2:02"`` to index and sub-index; ``ValueError`` for another form."""
     index, colon, sub = str(text).partition(":")
     if not colon:
         raise ValueError(f"{text!r}: expected an object such as '60C2:02', in quotes")
@@ -200,11 +192,7 @@ def address(text: str) -> Address:
 
 
 def dictionary_of(path: Path, node: int) -> canopen.ObjectDictionary:
-    """The object dictionary of an EDS or DCF file.
-
-    Raises:
-        InputFileError: not readable, or no such file.
-    """
+    """The object dictionary of an EDS or DCF file; ``InputFileError`` where it cannot be read."""
     try:
         return canopen.import_od(_text_of(path), node)
     except OSError as error:
@@ -214,11 +202,7 @@ def dictionary_of(path: Path, node: int) -> canopen.ObjectDictionary:
 
 
 def quirks_of_eds(path: Path, node: int) -> Quirks:
-    """What an EDS file says of access, limits, types and mapping.
-
-    Raises:
-        InputFileError: not readable.
-    """
+    """What an EDS file says of access, limits, types and mapping; ``InputFileError`` where it cannot be read."""
     read_only, not_mappable = set(), set()
     limits: dict[Address, tuple[int, int]] = {}
     types: dict[Address, IntegerType] = {}

@@ -40,11 +40,7 @@ def standing_fault(drive: Drive) -> Finding | None:
 
 
 def bring_back(drive: Drive, nmt: Callable[[int], None]) -> None:
-    """Out of fault or quick stop, without power; ``nmt`` sends the drive an NMT command.
-
-    Raises:
-        HardwareError: it has power, does not come back after the reset of its communication, or stays in fault.
-    """
+    """Out of fault or quick stop, without power; ``HardwareError`` where it has power, does not come back, or stays."""
     configure.refuse_if_powered(drive)
     configure.end_quick_stop(drive)
     nmt(NMT_RESET_COMMUNICATION)

@@ -45,18 +45,11 @@ class Scale:
 
 
 def scale_of(facts: Facts, joint: JointSetup, velocity_unit: int | None) -> tuple[Scale, list[Finding]]:
-    """Joint-side factors from the drive's own figures, and everything that does not fit the robot file.
+    """Joint-side factors from the drive's figures, and what does not fit the robot file; an ERROR forbids motion.
 
-    Options ``position_units_per_revolution`` (of the joint), ``velocity_unit_rad_s`` (joint side) and
-    ``rated_torque_side: joint`` override what a drive says wrongly or not at all.
-
-    Args:
-        facts: of the drive.
-        joint: of the robot file.
-        velocity_unit: 60A9 as it is or will be set, None where the drive has none.
-
-    Returns:
-        The factors, and findings; an ERROR among them forbids motion.
+    ``velocity_unit`` is 60A9 as it is or will be set, None where there is none. Options override what a drive says
+    wrongly or not at all: ``position_units_per_revolution`` (of the joint), ``velocity_unit_rad_s`` (joint side) and
+    ``rated_torque_side: joint``.
     """
     doubts = _Doubts(f"joint {joint.name}")
     shafts_per_joint = 1.0 if _shaft_is_joint(facts, joint, doubts) else joint.gear_ratio
@@ -112,19 +105,13 @@ def _polarity(facts: Facts, position_rad: float, doubts: _Doubts) -> None:
 
 
 def unit_rad(code: int) -> float | None:
-    """One unit of 60A8, rad of its shaft; None for increments and all that is no angle.
-
-    Source: object 60A8: byte 3 is the SI prefix as a signed power of ten, byte 2 the unit.
-    """
+    """One unit of 60A8 (byte 3: signed power of ten, byte 2: unit), rad of its shaft; None for all that is no angle."""
     angle, power = _ANGLES.get(code >> 16 & 0xFF), code >> 24 & 0xFF
     return None if angle is None else 10.0 ** (power - 256 if power > 127 else power) * angle
 
 
 def velocity_unit_rad_s(code: int) -> float | None:
-    """One unit of 60A9, rad/s of its shaft; None for a unit that is no angle per time.
-
-    Source: object 60A9: prefix and angle as in 60A8, byte 1 the time.
-    """
+    """One unit of 60A9 (as 60A8, byte 1 the time), rad/s of its shaft; None for a unit that is no angle per time."""
     angle, time_s = unit_rad(code), _TIMES.get(code >> 8 & 0xFF)
     return None if angle is None or time_s is None else angle / time_s
 
@@ -242,11 +229,7 @@ def _rated_torque(facts: Facts, joint: JointSetup, doubts: _Doubts) -> float:
 
 
 def raise_on_error(findings: list[Finding]) -> None:
-    """Turn the first ERROR into an exception.
-
-    Raises:
-        HardwareError: with the finding's words.
-    """
+    """``HardwareError`` in the words of the first ERROR."""
     for finding in findings:
         if finding.severity is Severity.ERROR:
             raise HardwareError(finding.message, where=finding.subject, next_step=finding.next_step)

@@ -120,11 +120,7 @@ _DELAYS = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "torque_lag
 
 
 def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettings]]:
-    """Check and read all options.
-
-    Raises:
-        InvalidFields: every option or node id that is wrong.
-    """
+    """Check and read all options; ``InvalidFields`` with every option or node id that is wrong."""
     problems: list[FieldProblem] = []
     bus = _bus(_Options(setup.options, BUS_OPTIONS, ("options",), problems))
     joints = {

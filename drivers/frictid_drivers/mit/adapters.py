@@ -42,11 +42,7 @@ class Port(Protocol):
 
 
 class SerialAdapter(can.BusABC):
-    """What both have in common.
-
-    Raises:
-        CanInitializationError: no such port, or somebody else has it.
-    """
+    """What both have in common; ``CanInitializationError`` where there is no such port, or somebody else has it."""
 
     def __init__(self, channel: str, tty_baudrate: int = BAUD, port: Port | None = None, **_: Any) -> None:
         try:
@@ -58,11 +54,7 @@ class SerialAdapter(can.BusABC):
         super().__init__(channel=channel)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send one frame.
-
-        Raises:
-            CanOperationError: the adapter cannot carry it, or is gone.
-        """
+        """Send one frame; ``CanOperationError`` where the adapter cannot carry it, or is gone."""
         packed = self._packed(msg)
         try:
             self._port.write(packed)

@@ -52,15 +52,9 @@ _USABLE = 0.9
 
 
 class MitDriver:
-    """A robot of MIT-mode actuators on one CAN bus.
+    """A robot of MIT-mode actuators on one CAN bus; ``InvalidFields`` where an option of the robot file is wrong.
 
-    Args:
-        setup: the robot; ``settings`` lists the options it may carry.
-        bus_factory: opens the bus instead of python-can (a simulated one).
-        clock: run time.
-
-    Raises:
-        InvalidFields: an option of the robot file is wrong.
+    ``bus_factory`` opens the bus instead of python-can (a simulated one).
     """
 
     kind = DriverKind(
@@ -86,12 +80,7 @@ class MitDriver:
     # -- reaching them ------------------------------------------------------------------------------------------
 
     def open(self, frame_sink: FrameSink | None = None) -> None:
-        """Take the bus and hear from every motor. Families that answer nothing else are told `off`.
-
-        Raises:
-            HardwareBusy: another process holds the bus.
-            HardwareError: no such bus, or a motor does not answer.
-        """
+        """Take the bus and hear from every motor. Families that answer nothing else are told `off`."""
         try:
             self._line = CanLine(self.setup.bus, self.setup.options, frame_sink, self.clock, self._bus_factory)
             for joint in self.setup.joints:
@@ -141,9 +130,7 @@ class MitDriver:
     def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
         """Mode and watchdog written and read back; every joint reports in every cycle, active or not.
 
-        Raises:
-            PlanRefused: more frames than the bus carries; the message has the highest rate.
-            HardwareError: a motor does not take a setting.
+        ``PlanRefused``, with the highest rate, where there are more frames than the bus carries.
         """
         line = self._open_line()
         for name in active:
@@ -179,11 +166,7 @@ class MitDriver:
         )
 
     def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
-        """Kept by the host in every frame: these motors have no limits of their own but their ranges.
-
-        Raises:
-            HardwareError: a limit lies outside what the motor's numbers can say.
-        """
+        """Kept by the host in every frame; ``HardwareError`` where a limit is beyond what the motor's numbers say."""
         settings, end_rad = self._settings[joint], self._usable_rad(joint)
         if max(abs(position_min_rad), abs(position_max_rad)) > end_rad:
             raise HardwareError(
@@ -209,11 +192,7 @@ class MitDriver:
         getattr(self.clock, "restart", lambda: None)()
 
     def enable(self, joint: str, mode: Mode) -> None:
-        """Ask for power; progress is in the feedback.
-
-        Raises:
-            HardwareError: torque mode without a watchdog, or no such mode.
-        """
+        """Ask for power; ``HardwareError`` for torque mode without a watchdog, or a mode that there is not."""
         if mode not in self.capabilities().modes:
             raise HardwareError(
                 f"mode {mode.name} refused",

@@ -46,11 +46,7 @@ def row_decoder(readers: Sequence[Reader]) -> RowDecoder:
 
 
 def decoder(frame_map: Mapping[str, Any]) -> RowLog:
-    """A decoder for logs with this frame map.
-
-    Raises:
-        InvalidFields: the map is not what ``frame_map_values`` writes.
-    """
+    """A decoder for logs with this frame map; ``InvalidFields`` where it is not what ``frame_map_values`` writes."""
     try:
         readers = []
         for at, joint in enumerate(frame_map["joints"].values()):

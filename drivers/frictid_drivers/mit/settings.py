@@ -64,11 +64,7 @@ class JointSettings:
 
 
 def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettings]]:
-    """All options, checked.
-
-    Raises:
-        InvalidFields: every option that is unknown or impossible.
-    """
+    """All options, checked; ``InvalidFields`` with every one that is unknown or impossible."""
     problems = unknown_options(setup.options, BUS_OPTIONS, ("options",), "mit")
     data_bitrate = _data_bitrate(setup.options, problems)
     joints: dict[str, JointSettings] = {}

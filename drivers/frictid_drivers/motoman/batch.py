@@ -197,13 +197,11 @@ class BatchClient:
         since each names itself (a job's state by its number, the others by how many figures they have).
 
         ``stop`` is asked often. ``look`` is called once per question with how long it may take; its ``SafetyAbort``
-        ends the job and is raised once the joint stands. ``follow`` is called between two rounds of questions, when the
-        line is free, with the state and how long it may take, for as long as it says that it did something.
+        ends the job and is raised once the joint stands. ``follow`` is called between two rounds of questions, when
+        the line is free, with the state and how long it may take, for as long as it says that it did something.
 
-        Raises:
-            Interrupted: ``stop`` asked for it.
-            SafetyAbort: the controller stopped it.
-            HardwareError: it does not come to an end, or the line is dead.
+        ``Interrupted`` where ``stop`` asked for it, ``SafetyAbort`` where the controller stopped, ``HardwareError``
+        where it does not come to an end, or the line is dead.
         """
         now_s = self.host.port.now_s
         within_s, patience_s = watchdog_s / 3, duration_s * 1.2 + 10.0

@@ -60,10 +60,7 @@ class JobRecord:
     def follow(self, state: JobState, within_s: float) -> bool:
         """While the job runs: fetch some of what waits, where it fills a block of the link; whether any came.
 
-        Nothing that goes wrong here may end the job: what is missing is fetched afterwards.
-
-        Raises:
-            HardwareError: the port is gone.
+        Nothing that goes wrong may end the job, but a port that is gone (``HardwareError``): the rest comes later.
         """
         self.dropped_pulses = state.dropped_pulses
         behind = state.done_ticks - self.count
@@ -77,12 +74,7 @@ class JobRecord:
         return self.count > before
 
     def complete(self, state: JobState, progress: Callable[[float], None]) -> None:
-        """Fetch what is missing of a job that is over; goes on after a broken transfer.
-
-        Raises:
-            LinkError: a part cannot be transferred in several attempts.
-            BadReply: what arrives instead is not this job's record.
-        """
+        """Fetch what is missing of a job that is over; ``LinkError`` after several attempts, or ``BadReply``."""
         self.dropped_pulses = state.dropped_pulses
         failures = 0
         while self.count < state.done_ticks:

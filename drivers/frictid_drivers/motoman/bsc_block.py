@@ -91,11 +91,7 @@ def block_check(covered: bytes) -> bytes:
 
 
 def encode_blocks(message: Message) -> list[bytes]:
-    """The blocks of a message, at most 256 data bytes each (the final CR counts), the first with the header.
-
-    Raises:
-        ValueError: header not ``hh,sss``, or text that is not printable ASCII.
-    """
+    """A message's blocks of at most 256 bytes (the CR counts); ``ValueError`` without ``hh,sss`` or printable ASCII."""
     header, data = message.header.encode("ascii"), message.text.encode("ascii")
     if len(header) != _HEADER_BYTES or header[2:3] != b",":
         raise ValueError(f"header {message.header!r} is not hh,sss")

@@ -45,13 +45,10 @@ _URGENT_S = 0.5
 
 
 class MotomanDriver:
-    """A MOTOMAN-class controller on a serial port.
+    """A MOTOMAN-class controller on a serial port; an emulator brings its own ``port_factory``, on virtual time.
 
-    An emulator in the same process brings its own ``port_factory``, on virtual time.
-
-    Raises:
-        InvalidFields: an option is unknown or impossible, or pulses per degree are missing.
-        ConfigError: the bus is no serial port.
+    ``InvalidFields`` where an option is unknown or impossible, or pulses per degree are missing; ``ConfigError`` where
+    the bus is no serial port.
     """
 
     kind = DriverKind(
@@ -137,11 +134,7 @@ class MotomanDriver:
         self._active = list(active)
 
     def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
-        """Bounds that this side keeps on every target, and sends along with every job.
-
-        Raises:
-            HardwareError: the controller's own travel is narrower.
-        """
+        """Kept on every target, and sent along with every job; ``HardwareError`` beyond the controller's own travel."""
         limits = self._limits[joint] = Limits(position_min_rad, position_max_rad, torque_nm)
         welcome = self._reach.welcome
         if welcome is None:
@@ -256,16 +249,10 @@ class MotomanDriver:
         look: Callable[[Sequence[Feedback]], None] | None = None,
         arrived: Callable[[Mapping[str, Any]], None] = lambda samples: None,
     ) -> Mapping[str, Any]:
-        """One joint's motions as one job on the controller; see ``Batched.run_batch``.
+        """One joint's motions as one job on the controller; see ``Batched.run_batch``, also for what it raises.
 
         ``look`` is given what ``standing`` says about twice a second. Times are run time, from the controller's answer
         to the start on.
-
-        Raises:
-            PlanRefused: a motion that the controller cannot make.
-            SafetyAbort: the controller stopped, or ``look`` did.
-            Interrupted: ``stop`` asked for it.
-            HardwareError: the line failed, or the joint does not stand at the start.
         """
         line, hello = self._open_line(), self._reach.batch
         if hello is None:
@@ -330,10 +317,7 @@ class MotomanDriver:
         """Give the controller one joint's friction curve, to be compensated on its own tick.
 
         The ratio is R of (24c), the stiffness K of (24a); while the joint floats, gravity_cos cos(q) + gravity_sin
-        sin(q) holds it.
-
-        Raises:
-            HardwareError: no such application, or the table reads back differently.
+        sin(q) holds it. ``HardwareError`` without such an application, or where the table reads back differently.
         """
         if not self.capabilities().table_download:
             raise HardwareError("this controller takes no friction table", where=f"joint {joint}")

@@ -144,16 +144,10 @@ class HostControl:
     def ask(
         self, text: str, on_text: Callable[[str, int], None] | None = None, *, within_s: float | None = None
     ) -> str:
-        """A command that is answered by data.
+        """A command that is answered by data, within the link's own time or ``within_s``.
 
-        Args:
-            text: the command.
-            on_text: told of every block of the reply as it comes (text, index), also when the rest never comes.
-            within_s: give up after this time instead of the link's own.
-
-        Raises:
-            ControllerError: the controller refused it.
-            LinkError: no answer, or a broken one.
+        ``on_text`` is told of every block of the reply as it comes (text, index), also when the rest never comes.
+        ``ControllerError`` where the controller refuses, ``LinkError`` where no answer or a broken one comes.
         """
         reply = self._exchange(text, on_text, within_s=within_s)
         if reply.header != _DATA:
@@ -276,11 +270,7 @@ class ServoPower:
         self.ours = False
 
     def on(self) -> None:
-        """Release a command hold that was left behind, switch servo power on, and see that it is.
-
-        Raises:
-            HardwareError: ordered, but not seen.
-        """
+        """Release a command hold that was left behind, then power on; ``HardwareError`` where it is not seen."""
         status = self._host.status()
         if "command hold" in status.conditions:
             self._host.order("HOLD 0")
@@ -300,7 +290,7 @@ class ServoPower:
     def off(self, *, urgent: bool = False) -> None:
         """Wait for standstill, a second at most, then switch it off.
 
-        ``urgent``: something failed; half a second per command, and power goes off also where the arm cannot be seen.
+        ``urgent``: something failed; half a second per command, and power goes off also where the arm is not seen.
         """
         within_s = _URGENT_S if urgent else None
         with suppress(FrictidError) if urgent else nullcontext():

@@ -69,11 +69,7 @@ class AxisUnits:
 
 
 def axis_units(joints: Sequence[JointSetup]) -> dict[str, AxisUnits]:
-    """Conversions of every joint by name.
-
-    Raises:
-        InvalidFields: an unknown option, ``options.pulses_per_degree`` missing or not positive, two joints on one axis.
-    """
+    """Conversions of every joint by name; ``InvalidFields`` with all that is unknown, missing, impossible or taken."""
     problems: list[FieldProblem] = []
     made: dict[str, AxisUnits] = {}
     for joint in joints:

@@ -59,12 +59,7 @@ class Line:
         self._session_number = int(port.now_s() * 10.0) % 255
 
     def begin_stream(self, axis_mask: int) -> StreamSession:
-        """FSTREAM, the other speed, HELLO.
-
-        Raises:
-            ControllerError: streaming refused.
-            LinkError: granted, but nothing is heard at the other speed.
-        """
+        """FSTREAM, the other speed, HELLO; ``ControllerError`` where refused, ``LinkError`` without a HELLO."""
         options = self._options
         self.host.order(f"FSTREAM 1,{options.stream_baud},{self._tick_us},{axis_mask}")
         self.host.leave()

@@ -53,9 +53,7 @@ class BytePort(Protocol):
 class SerialPort:
     """A serial port of this machine, held exclusively; its parity is never changed silently.
 
-    Raises:
-        HardwareBusy: another process holds it.
-        HardwareError: it does not exist, may not be opened, or does not accept the parity.
+    ``HardwareBusy`` where another process holds it, ``HardwareError`` where it cannot be opened like this.
     """
 
     def __init__(self, path: str, baud: int, parity: str) -> None:

@@ -40,11 +40,7 @@ class JobMotion:
 
 
 def motion_segments(motions: Sequence[Motion], units: AxisUnits, tick_s: float) -> JobMotion:
-    """Segments of the motions, in order.
-
-    Raises:
-        PlanRefused: a motion that the controller has no segment for, or cycles that are no whole number of ticks.
-    """
+    """Segments of the motions, in order; ``PlanRefused`` where there is none, or cycles are no whole ticks."""
     start = units.pulses(float(motions[0].position_rad(np.zeros(1))[0]))
     texts: list[str] = []
     command: list[int] = [start]

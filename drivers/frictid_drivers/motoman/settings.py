@@ -61,11 +61,7 @@ class SerialOptions:
 
 
 def serial_options(mapping: Mapping[str, Any]) -> SerialOptions:
-    """The options, every one checked; ``emulator`` is read by the emulator only.
-
-    Raises:
-        InvalidFields: an unknown option, or a value that is not possible.
-    """
+    """The options, every one checked (``InvalidFields``); ``emulator`` is read by the emulator only."""
     known = {entry.name: entry for entry in fields(SerialOptions)}
     problems = unknown_options(mapping, {*known, "emulator"}, ("options",), "motoman")
     values = {name: value for name, value in mapping.items() if name in known}

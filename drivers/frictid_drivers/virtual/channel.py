@@ -20,8 +20,7 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
 def runtime_folder() -> Path:
     """Where locks and sockets live: ``$FRICTID_RUNTIME_DIR``, ``$XDG_RUNTIME_DIR``, or a temporary folder per user.
 
-    Raises:
-        HardwareError: it cannot be created, or others may write to it.
+    ``HardwareError`` where it cannot be created, or others may write to it.
     """
     own = os.environ.get("FRICTID_RUNTIME_DIR")
     session = os.environ.get("XDG_RUNTIME_DIR")
@@ -60,12 +59,7 @@ def socket_path(channel: str) -> Path:
 
 
 def take(channel: str) -> filelock.BaseFileLock:
-    """Take the channel for this process; release the lock that comes back.
-
-    Raises:
-        HardwareBusy: another process, or another driver of this one, has it.
-        HardwareError: the lock file cannot be written.
-    """
+    """Take the channel, and return its lock to release; ``HardwareBusy`` where it is taken, ``HardwareError`` else."""
     path = runtime_folder() / f"{channel}.lock"
     lock = filelock.FileLock(path, timeout=0)
     try:

@@ -21,11 +21,7 @@ _TORQUE_MODE = 10
 
 
 def plant_for(robot: RobotSetup, joint: JointSetup, period_s: float = CONTROL_PERIOD_S) -> ServoLoop:
-    """The simulated joint under inner loops, where the robot file locks it; the robot's seed is that of its noise.
-
-    Raises:
-        InvalidFields: the joint's ``simulated`` mapping is wrong.
-    """
+    """The simulated joint under inner loops, where the robot file locks it; ``InvalidFields`` by ``simulated``."""
     return ServoLoop(
         JointModel.of(joint, joint.name),
         period_s=period_s,

@@ -128,8 +128,7 @@ class VirtualDriver:
     ) -> None:
         """Let a person guide a joint along centre + amplitude sin(2 pi f t), t from now; frequency 0 lets go.
 
-        Raises:
-            UsageError: the robot file gives this joint no ``hand``.
+        ``UsageError`` where the robot file gives this joint no ``hand``.
         """
         grip = frequency_hz > 0.0
         if grip and "hand" not in self._setup.joint(joint).simulated:
@@ -182,13 +181,10 @@ def _objects(joint: JointSetup, *, fd: bool) -> dict[str, Any]:
 
 
 def write_object(bus: can.BusABC, node: int, index: int, subindex: int, value: int) -> None:
-    """One expedited SDO download by a second member of the bus.
+    """One expedited SDO download by a second member of the bus; ``HardwareError`` where refused, or without an answer.
 
     What a person's hand does to a joint, or a payload on it, is no part of a robot's control; it must not take the
     host's SDO client, nor wait for its cycle.
-
-    Raises:
-        HardwareError: refused, or no answer.
     """
     address = key(index, subindex)
     size = next(

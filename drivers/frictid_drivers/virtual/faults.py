@@ -144,9 +144,7 @@ def faults_of(
 ) -> tuple[Fault, ...]:
     """The faults of a robot file and of the environment: of kinds that its drives know, and frames on its wire.
 
-    Raises:
-        InvalidFields: what is wrong with the robot file's.
-        UsageError: the environment's are not JSON.
+    ``InvalidFields`` where the list is wrong, ``UsageError`` where the environment's is not JSON.
     """
     text = os.environ.get(ENVIRONMENT, "")
     try:
@@ -164,10 +162,9 @@ def faults_of(
 def read_faults(
     rows: Any, nodes: Mapping[str, int], *, kinds: tuple[str, ...] = KINDS, frames: tuple[str, ...] = tuple(SERVICES)
 ) -> tuple[Fault, ...]:
-    """The list under ``options.faults``, None for none; it may name these joints (with their nodes), kinds and frames.
+    """The list under ``options.faults``, None for none, of these joints (with their nodes), kinds and frames.
 
-    Raises:
-        InvalidFields: what is wrong, by ``options.faults.N.KEY``.
+    ``InvalidFields`` tells what is wrong, by ``options.faults.N.KEY``.
     """
     top = Fields({})
     top.path = ("options", "faults")

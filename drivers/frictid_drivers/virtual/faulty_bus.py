@@ -33,11 +33,7 @@ _OF_A_NODE = frozenset(base for name, bases in SERVICES.items() if name != "host
 
 
 class FaultyBus(can.BusABC):
-    """A bus in front of a bus.
-
-    Raises:
-        can.CanInitializationError: a fault is not described as it must be.
-    """
+    """A bus in front of a bus; ``can.CanInitializationError`` where a fault is not described as it must be."""
 
     def __init__(
         self,
@@ -74,11 +70,7 @@ class FaultyBus(can.BusABC):
         self._start_ns = self._clock()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send what the cable makes of the frame.
-
-        Raises:
-            Exception: whatever the faults say.
-        """
+        """Send what the cable makes of the frame; raises whatever the faults say."""
         if msg.arbitration_id == SYNC_ID and self._start_ns is None:
             self.begin()
         self._fail("send_error")

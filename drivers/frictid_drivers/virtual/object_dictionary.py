@@ -109,22 +109,14 @@ class ObjectDictionary:
         return value
 
     def entry(self, address: Key) -> Entry:
-        """The description of a value.
-
-        Raises:
-            SdoAbort: no such object or subindex.
-        """
+        """The description of a value; ``SdoAbort`` where there is no such object or subindex."""
         found = self.entries.get(address)
         if found is None:
             raise SdoAbort(Abort.NO_SUBINDEX if address >> 8 in self.indices else self.manner.no_object)
         return found
 
     def upload(self, address: Key) -> bytes:
-        """The bytes that an SDO upload carries.
-
-        Raises:
-            SdoAbort: unknown, or write-only.
-        """
+        """The bytes that an SDO upload carries; ``SdoAbort`` where it is unknown, or write-only."""
         entry = self.entry(address)
         if entry.access == "wo":
             raise SdoAbort(Abort.WRITE_ONLY)
@@ -134,11 +126,7 @@ class ObjectDictionary:
         return encode(entry, self.values[address])
 
     def download(self, address: Key, data: bytes) -> None:
-        """Store the bytes of an SDO download.
-
-        Raises:
-            SdoAbort: unknown, read-only, of the wrong length, out of range, or refused by the drive's present state.
-        """
+        """Store the bytes of an SDO download; ``SdoAbort`` by access, length, range, or the drive's present state."""
         entry = self.entry(address)
         if entry.access in ("ro", "const"):
             raise SdoAbort(Abort.READ_ONLY)
@@ -163,11 +151,7 @@ def encode(entry: Entry, value: Value) -> bytes:
 
 
 def decode(entry: Entry, data: bytes) -> Value:
-    """The value that bytes stand for.
-
-    Raises:
-        SdoAbort: wrong length for the type, or text that is not printable ASCII.
-    """
+    """The value of bytes; ``SdoAbort`` for a wrong length, or text that is not printable ASCII."""
     if entry.kind is DataType.STRING:
         if len(data) > MAX_STRING_BYTES:
             raise SdoAbort(Abort.TOO_LONG)

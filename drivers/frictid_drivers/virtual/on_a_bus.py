@@ -64,11 +64,8 @@ class BusWire:
 def serve(setup: RobotSetup, *, announce: Callable[[str], None], stop: Callable[[], bool] = lambda: False) -> None:
     """Run until ``stop``, asked many times a second, says so; ``announce`` is told the bus once the drives are on it.
 
-    The robot's ``bus`` and ``options`` say where these drives are, and what goes wrong.
-
-    Raises:
-        InvalidFields: the simulated joints or faults of the robot file are wrong.
-        HardwareError: the bus cannot be opened.
+    The robot's ``bus`` and ``options`` say where these drives are, and what goes wrong. ``InvalidFields`` where joints
+    or faults are wrong, ``HardwareError`` where the bus cannot be opened.
     """
     faults, rack = faults_of(setup), Rack()
     rack.install(setup, missing=missing_objects(faults), sync_gap_tenths=SYNC_GAP_TENTHS)

@@ -75,11 +75,9 @@ def known_personalities() -> dict[str, dict[str, Any]]:
 
 
 def personality_of(joint: JointSetup, folder: Path | None = None) -> Personality | None:
-    """The family that a joint's options ``personality`` or ``eds`` (from the robot file's folder) name; None: standard.
+    """The family of a joint's option ``personality`` or ``eds`` (from the robot file's folder); None: standard.
 
-    Raises:
-        InvalidFields: no such family.
-        InputFileError: the EDS file cannot be read.
+    ``InvalidFields`` where there is no such family, ``InputFileError`` where the EDS file cannot be read.
     """
     name, eds = joint.options.get("personality"), joint.options.get("eds")
     if name is not None:

@@ -49,11 +49,8 @@ class Rack:
         """Build the drives of a robot file in; they have no power yet.
 
         ``missing``: indices of objects that drives do not have, by joint; ``sync_gap_tenths``: longest gap between
-        SYNCs that drives tolerate, in tenths of the period.
-
-        Raises:
-            InvalidFields: some joint's ``simulated`` mapping, or ``simulated_arm``, is wrong.
-            ConfigError: the library that a simulated arm needs is not installed.
+        SYNCs that drives tolerate, in tenths of the period. ``InvalidFields`` where a joint's ``simulated`` mapping, or
+        ``simulated_arm``, is wrong; ``ConfigError`` without the library that a simulated arm needs.
         """
         arm = arm_of(setup)
         plants = [plant_for(setup, joint) for joint in setup.joints]
@@ -150,11 +147,7 @@ def couple(model: ArmModel, plants: Sequence[ServoLoop], axes: Sequence[Axis]) -
 
 
 def arm_of(setup: RobotSetup) -> ArmModel | None:
-    """The simulated arm of a robot file, None where it has none.
-
-    Raises:
-        InvalidFields: what is wrong with it, by ``simulated_arm.KEY``.
-    """
+    """The simulated arm of a robot file, None where it has none; ``InvalidFields`` by ``simulated_arm.KEY``."""
     if not setup.simulated_arm:
         return None
     try:

@@ -45,11 +45,7 @@ class RunningRack:
 
 
 def start_rack(setup: RobotSetup) -> RunningRack:
-    """Start the drives of a robot in a process of their own.
-
-    Raises:
-        HardwareError: it did not come up; the message says why.
-    """
+    """Start a robot's drives in a process of their own; ``HardwareError`` says why it did not come up."""
     process = subprocess.Popen(
         [sys.executable, "-m", "frictid_drivers.virtual.rack_process"],
         stdin=subprocess.PIPE,

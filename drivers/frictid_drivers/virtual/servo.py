@@ -363,11 +363,7 @@ class Servo:
         return self.dictionary.number(key(0x1006)) * 1000
 
     def write(self, index: int, subindex: int, value: int, now_ns: int) -> None:
-        """Write an object from inside, as an SDO download would.
-
-        Raises:
-            SdoAbort: refused.
-        """
+        """Write an object from inside, as an SDO download would; ``SdoAbort`` where refused."""
         entry = self.dictionary.entry(key(index, subindex))
         self._arrive(now_ns)
         self.dictionary.download(entry.key, encode(entry, value))

@@ -57,14 +57,9 @@ def _prepare(end: socket.socket, poll: select.poll) -> None:
 
 
 class SocketBus(can.BusABC):
-    """One member of the bus.
+    """One member of the bus, by its name or the path of its socket; arguments of other interfaces mean nothing here.
 
-    Args:
-        channel: name of the bus, or path of its socket.
-        arguments: of other interfaces (``bitrate``), of no meaning here.
-
-    Raises:
-        can.CanInitializationError: nobody simulates drives on this channel.
+    ``can.CanInitializationError`` where nobody simulates drives on this channel.
     """
 
     def __init__(self, channel: Any = "frictid", can_filters: Any = None, **arguments: Any) -> None:
@@ -84,11 +79,7 @@ class SocketBus(can.BusABC):
         self.frames = None if can_filters else SocketFrames(self._socket, stamped=True)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Put a frame on the bus.
-
-        Raises:
-            can.CanOperationError: the bus is gone, or full for longer than ``timeout``.
-        """
+        """Put a frame on the bus; ``can.CanOperationError`` where it is gone, or full for longer than ``timeout``."""
         flags = EXTENDED * msg.is_extended_id | REMOTE * msg.is_remote_frame | ERROR * msg.is_error_frame
         packet = pack(msg.arbitration_id | flags, bytes(msg.data), time.monotonic_ns(), fd=msg.is_fd)
         deadline_s = time.monotonic() + (timeout if timeout else 0.0)

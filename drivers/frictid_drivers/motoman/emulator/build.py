@@ -33,11 +33,7 @@ _DEFAULTS: Mapping[str, float | bool] = {
 
 
 def build(setup: RobotSetup, faults: FaultPlan | None = None) -> Emulator:
-    """The controller of this robot, switched on, arm at its locked positions, servo power off.
-
-    Raises:
-        InvalidFields: an option of ``options.emulator``, pulses per degree, or a ``simulated`` mapping is wrong.
-    """
+    """This robot's controller, arm at its locked positions, servo power off; ``InvalidFields`` where it cannot be."""
     options = _options(setup.options.get("emulator", {}))
     settings = _settings(setup, options)
     joints = [joint for _, joint in sorted({joint.address: joint for joint in setup.joints}.items())]

@@ -52,11 +52,7 @@ class Fault:
 
     @staticmethod
     def parse(text: str) -> Fault:
-        """From ``kind@n``, ``kind@nxK``, ``kind@n:value``.
-
-        Raises:
-            UsageError: not of this form, or no such kind.
-        """
+        """From ``kind@n``, ``kind@nxK``, ``kind@n:value``; ``UsageError`` for another form, or no such kind."""
         match = _WRITTEN.match(text.strip())
         if match is None or match[1] not in OCCASIONS:
             raise UsageError(
