@@ -47,8 +47,7 @@ from frictid_drivers.cia402.frame_map import FrameMap
 from frictid_drivers.cia402.network import Node, SdoDrive, Wire
 from frictid_drivers.mit.families import FAMILIES, Motor, Parameter
 from frictid_drivers.mit.models import MODELS
-from frictid_drivers.motoman.bsc import BscLink
-from frictid_drivers.motoman.bsc_block import Message, encode_blocks
+from frictid_drivers.motoman.bsc import BscLink, Message, encode_blocks
 from frictid_drivers.motoman.stream_frames import FrameReader, FrameType, encode_frame
 from frictid_drivers.servos.packets import Dynamixel, Feetech
 from frictid_hil.config.columns import load_columns

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from frictid_drivers.motoman.bsc import BscLink
-from frictid_drivers.motoman.bsc_block import (
+from frictid_drivers.motoman.bsc import (
     BlockReceived,
+    BscLink,
     BscTiming,
     Event,
     Failed,

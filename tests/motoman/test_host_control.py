@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from serial_bench import START_RAD, make_bench
 
 from frictid_drivers.motoman import controller_errors
-from frictid_drivers.motoman.bsc_block import BscTiming, Message, encode_blocks
+from frictid_drivers.motoman.bsc import BscTiming, Message, encode_blocks
 from frictid_drivers.motoman.controller_errors import (
     AlarmOrError,
     BadReply,

@@ -67,22 +67,6 @@ class BitPacking:
 class _Report:
     """One PDO of one joint as last received."""
 
-    __slots__ = (
-        "awaited",
-        "cycle",
-        "error_at",
-        "figures",
-        "inputs_at",
-        "joint",
-        "mode_at",
-        "size",
-        "slow",
-        "status_at",
-        "t_ns",
-        "unpack",
-        "values",
-    )
-
     def __init__(self, frame: Frame, joint: JointFrames) -> None:
         codec = packing(frame.types)
         self.size = codec.size
@@ -274,8 +258,6 @@ class Decoder:
 
 class Command:
     """One PDO that the host sends: named integers in, cut to the bounds of their type, the same bytes buffer out."""
-
-    __slots__ = ("_at", "_bounds", "_pack", "_values", "cob_id", "data")
 
     def __init__(self, frame: Frame) -> None:
         codec = packing(frame.types)

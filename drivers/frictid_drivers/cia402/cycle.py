@@ -51,8 +51,6 @@ _FIRST_HEARTBEAT_NS = 500_000_000  # a drive's first heartbeat may take this lon
 class _Outgoing:
     """One command frame, sent when due; remembers what the drive has been told."""
 
-    __slots__ = ("axis", "can_id", "data", "primary", "told", "told_cycle")
-
     def __init__(self, axis: Axis, command: Command, *, fd: bool) -> None:
         self.axis = axis
         self.primary = command is axis.primary

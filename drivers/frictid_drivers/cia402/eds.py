@@ -28,7 +28,6 @@ class _File:
     """An object dictionary on disk, asked like a drive."""
 
     def __init__(self, path: Path, joint: JointSetup) -> None:
-        self._path = path
         self._dictionary = dictionary_of(path, joint.address)
 
     def variable(self, index: int, sub: int) -> ODVariable | None:

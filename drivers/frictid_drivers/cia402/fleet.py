@@ -66,11 +66,6 @@ class Fleet:
             drive.learn(merged(facts.quirks, quirks_of_eds(eds, drive.node_id)) if eds else facts.quirks)
 
     @property
-    def sync_counter(self) -> bool:
-        """Every drive can spread its reports by start values."""
-        return all(facts.sync_counter for facts in self.facts.values())
-
-    @property
     def watchdog(self) -> bool:
         """Every drive notices when the host dies."""
         return all(self.watches(joint) for joint in self.facts)
@@ -101,7 +96,7 @@ class Fleet:
             [self._wish(joint) for joint in self._setup.joints],
             active,
             cycle_hz,
-            sync_counter=self.sync_counter,
+            sync_counter=all(facts.sync_counter for facts in self.facts.values()),
             host_heartbeat_s=self._settings.host_heartbeat_s,
             drive_heartbeat_s=self._settings.drive_heartbeat_ms * 1e-3,
             rates=self._settings.rates,

@@ -150,21 +150,13 @@ def _state(drive: Drive) -> list[Said]:
     if state is DriveState.ENABLED:
         said.append((_ERROR, f"the power stage is already on ({word})", "switch the drive off"))
     if state is DriveState.QUICK_STOP_ACTIVE or (error == _HOST_LOST and state is DriveState.SWITCH_ON_DISABLED):
+        what = f"an earlier run was cut off: the drive stopped by itself ({word}, error {error:#06x})"
         said.append(
-            (
-                _WARNING,
-                f"an earlier run was cut off: the drive stopped by itself ({word}, error {error:#06x})",
-                "make sure that nothing holds the arm; the drive is switched off before anything else",
-            )
+            (_WARNING, what, "make sure that nothing holds the arm; the drive is switched off before anything else")
         )
     elif state in (DriveState.FAULT, DriveState.FAULT_REACTION):
-        said.append(
-            (
-                _ERROR,
-                f"error {told_error(error)} is pending ({word})",
-                "clear its cause (the code is in the drive's manual), then `frictid-hil reset`",
-            )
-        )
+        cure = "clear its cause (the code is in the drive's manual), then `frictid-hil reset`"
+        said.append((_ERROR, f"error {told_error(error)} is pending ({word})", cure))
     elif error:
         said.append((_WARNING, f"the last error was {told_error(error)}; the drive is healthy ({word})"))
     register = drive.find(od.ERROR_REGISTER) or 0

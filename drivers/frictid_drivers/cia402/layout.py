@@ -111,16 +111,13 @@ def plan_layout(
     active: Sequence[str],
     cycle_hz: float,
     *,
-    sync_counter: bool,
+    sync_counter: bool,  # every drive has 1019 and 18xx:06
     host_heartbeat_s: float,
     drive_heartbeat_s: float,
     rates: BitRates,
-    pdo_bytes: int = 8,
+    pdo_bytes: int = 8,  # how long the drives' PDOs may be
 ) -> Layout:
-    """Decide every PDO, for joints of which the active ones report on every SYNC.
-
-    ``sync_counter``: every drive has 1019 and 18xx:06; ``pdo_bytes``: how long the drives' PDOs may be.
-    """
+    """Decide every PDO, for joints of which the active ones report on every SYNC."""
     interval = max(1, min(_MAX_TYPE, math.floor(REPORT_INTERVAL_S * cycle_hz + 1e-9)))
     slow = interval * max(1, min(_SLOW_FACTOR, _MAX_TYPE // interval))
     starts = (
@@ -154,32 +151,25 @@ def _starts(
     wishes: Sequence[NodeWish], interval: int, slow: int, rates: BitRates, pdo_bytes: int
 ) -> dict[str, tuple[int, int]]:
     """Start values (reports, slow report) of every joint as if all were locked; 0 where each SYNC is answered."""
-    slots = _Slots(slow)
+    filled = [0.0] * slow  # bits in each SYNC of one turn of the counter
     fd = rates.data is not None
     fast_starts = {}
     for wish in wishes:
         pdos = _pdos(wish, pdo_bytes, (1, 0), (1, 0))
         fast = [SyncFrame(pdo.frame.size, fd=fd) for pdo in pdos if pdo.transmit and pdo.number < 3]
         bits = sum(frame.bits(rates).worst for frame in fast)
-        fast_starts[wish.joint] = slots.take(interval, bits) if interval > 1 else 0
+        fast_starts[wish.joint] = _take(filled, interval, bits) if interval > 1 else 0
     # The slow ones go where the others left room.
     bits = SyncFrame(5, fd=fd).bits(rates).worst
-    return {wish.joint: (fast_starts[wish.joint], slots.take(slow, bits) if slow > 1 else 0) for wish in wishes}
+    return {wish.joint: (fast_starts[wish.joint], _take(filled, slow, bits) if slow > 1 else 0) for wish in wishes}
 
 
-class _Slots:
-    """SYNCs of one turn of the counter, and how full each is."""
-
-    def __init__(self, count: int) -> None:
-        self._bits = [0.0] * count
-
-    def take(self, every: int, bits: float) -> int:
-        """The start value, from 1, that leaves the fullest SYNC least full."""
-        count = len(self._bits)
-        start = min(range(every), key=lambda first: max(self._bits[first::every]))
-        for slot in range(start, count, every):
-            self._bits[slot] += bits
-        return start + 1
+def _take(filled: list[float], every: int, bits: float) -> int:
+    """The start value, from 1, that leaves the fullest SYNC least full."""
+    start = min(range(every), key=lambda first: max(filled[first::every]))
+    for slot in range(start, len(filled), every):
+        filled[slot] += bits
+    return start + 1
 
 
 def _pdos(wish: NodeWish, pdo_bytes: int, often: tuple[int, int], seldom: tuple[int, int]) -> tuple[Pdo, ...]:

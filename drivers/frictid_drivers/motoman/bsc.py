@@ -2,10 +2,13 @@
 
 One station bids with ENQ, sends its blocks, each answered by an alternating acknowledgement, and ends with EOT::
 
-    ENQ ->                       <- ACK0
-    SOH hh,sss STX data ... BCC  <- ACK1        first block
-    STX data ... BCC             <- ACK0        continuation, after a block that ended in ETB
+    ENQ ->                                   <- ACK0
+    SOH hh,sss STX data (CR ETX | ETB) BCC   <- ACK1        first block
+    STX data (CR ETX | ETB) BCC              <- ACK0        continuation, after a block that ended in ETB
     EOT ->
+
+The block check is a 16-bit **sum** of everything after the leading SOH (STX in a continuation) up to and including ETX
+or ETB, low byte first. Its two bytes may look like any control code: after ETX or ETB exactly two raw bytes are taken.
 
 Framing, codes, timers and retry counts are public. How a controller recovers (what ENQ means in the middle of a
 message, who yields when both bid) is not; this module does what BSC always did: ENQ asks for the last answer again.
@@ -16,29 +19,127 @@ The line is idle, ours (``Sender``) or the other side's (``Receiver``).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
 
-from frictid_drivers.motoman.bsc_block import (
-    ACK,
-    CR,
-    DLE,
-    ENQ,
-    EOT,
-    ETB,
-    ETX,
-    LONGEST_BLOCK,
-    NAK,
-    SOH,
-    STX,
-    BlockReceived,
-    BscTiming,
-    Event,
-    Failed,
-    Message,
-    Received,
-    Sent,
-    decode_block,
-    encode_blocks,
-)
+SOH: Final = 0x01
+STX: Final = 0x02
+ETX: Final = 0x03
+EOT: Final = 0x04
+ENQ: Final = 0x05
+CR: Final = 0x0D
+DLE: Final = 0x10
+NAK: Final = 0x15
+ETB: Final = 0x17
+ACK: Final = (bytes([DLE, 0x30]), bytes([DLE, 0x31]))  # the two acknowledgements, which alternate from block to block
+
+MAX_DATA_BYTES: Final = 256
+_HEADER_BYTES: Final = 6
+LONGEST_BLOCK: Final = 1 + _HEADER_BYTES + 1 + MAX_DATA_BYTES + 1
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One whole message: a header ``hh,sss``, and printable ASCII without the CR that ends it."""
+
+    header: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One block, read and checked: header "" on a continuation, text without the final CR, last where ETX ended it."""
+
+    header: str
+    text: str
+    last: bool
+
+
+@dataclass(frozen=True, slots=True)
+class BscTiming:
+    """Timers and retries, defaults of the controller's parameters RS034-RS037."""
+
+    sequence_s: float = 3.0  # timer A (RS034): how long an answer may take
+    text_end_s: float = 20.0  # timer B (RS035): how long the rest of a text, or the next block, may take
+    response_retries: int = 10  # retry 1 (RS036): invalid or missing answers before giving up
+    text_retries: int = 3  # retry 2 (RS037): NAKs to the same text before giving up
+    quiet_s: float = 0.1  # silence after which garbage on the line is considered over (our choice, no parameter)
+
+
+@dataclass(frozen=True, slots=True)
+class BlockReceived:
+    """One block of a message arrived intact; worth keeping even when the rest of the message never comes."""
+
+    text: str
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """The last block of a message arrived intact and was acknowledged."""
+
+    message: Message
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """Our message was acknowledged to its last block."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """The link gave up on a message; ``reason`` says why."""
+
+    reason: str
+
+
+Event = BlockReceived | Received | Sent | Failed
+
+
+def block_check(covered: bytes) -> bytes:
+    """The 16-bit sum of the covered bytes, low byte first."""
+    return (sum(covered) & 0xFFFF).to_bytes(2, "little")
+
+
+def encode_blocks(message: Message) -> list[bytes]:
+    """A message's blocks of at most 256 bytes (the CR counts); ``ValueError`` without ``hh,sss`` or printable ASCII."""
+    header, data = message.header.encode("ascii"), message.text.encode("ascii")
+    if len(header) != _HEADER_BYTES or header[2:3] != b",":
+        raise ValueError(f"header {message.header!r} is not hh,sss")
+    if not _printable(data):
+        raise ValueError("the text of a block may hold printable ASCII only")
+    data += bytes([CR])
+    blocks = []
+    for start in range(0, len(data), MAX_DATA_BYTES):
+        end_code = ETX if start + MAX_DATA_BYTES >= len(data) else ETB
+        lead, covered = (SOH, header + bytes([STX])) if start == 0 else (STX, b"")
+        covered += data[start : start + MAX_DATA_BYTES] + bytes([end_code])
+        blocks.append(bytes([lead]) + covered + block_check(covered))
+    return blocks
+
+
+def decode_block(raw: bytes) -> Block | None:
+    """The block in these bytes, from SOH or STX to the end of the block check; None where anything is wrong with it."""
+    covered, check = raw[1:-2], raw[-2:]
+    if len(covered) < 1 or check != block_check(covered):
+        return None
+    header, data, last = b"", covered[:-1], covered[-1] == ETX
+    if raw[0] == SOH:
+        header, stx, data = data[:_HEADER_BYTES], data[_HEADER_BYTES : _HEADER_BYTES + 1], data[_HEADER_BYTES + 1 :]
+        if stx != bytes([STX]):
+            return None
+    if last:
+        if data[-1:] != bytes([CR]):
+            return None
+        data = data[:-1]
+    if not (_printable(header) and _printable(data)):
+        return None
+    return Block(header.decode("ascii"), data.decode("ascii"), last)
+
+
+def _printable(data: bytes) -> bool:
+    return all(0x20 <= byte < 0x7F for byte in data)
+
 
 _BID = bytes([ENQ])
 
@@ -89,8 +190,6 @@ class Sender:
             what = "ENQ" if self._bidding else "a block"
             return self._give_up(f"no answer to {what}, asked {self._response_retries} times")
         return self._say(_BID, now_s, again=True)
-
-    # -- inside ------------------------------------------------------------------------------------------------
 
     @property
     def _bidding(self) -> bool:
@@ -227,8 +326,6 @@ class Receiver:
         self._forget_block()
         self.over = True
 
-    # -- one block ---------------------------------------------------------------------------------------------
-
     def _read(self, byte: int, now_s: float) -> None:
         raw = self._raw
         if not raw:
@@ -280,8 +377,6 @@ class Receiver:
         if last:
             self._events.append(Received(Message(self._header, "".join(self._texts))))
 
-    # -- answers -----------------------------------------------------------------------------------------------
-
     def _reject(self, now_s: float) -> None:
         self._rejections += 1
         if self._rejections > self.timing.text_retries + 1:
@@ -309,8 +404,6 @@ class Receiver:
         # A sender that misses this answer asks after its own timer A; being still here then costs nothing.
         self.deadline_s = now_s + (2 * self.timing.sequence_s if self._complete else self.timing.text_end_s)
         self._forget_block()
-
-    # -- the end -----------------------------------------------------------------------------------------------
 
     def _peer_ended(self) -> None:
         if not self._complete and self._texts:
@@ -410,8 +503,6 @@ class BscLink:
         else:
             self._receiver.expire(now_s)
             self._use_free_line(now_s)
-
-    # -- whose line it is --------------------------------------------------------------------------------------
 
     @property
     def _free(self) -> bool:

@@ -13,8 +13,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
-from frictid_drivers.motoman.bsc import BscLink
-from frictid_drivers.motoman.bsc_block import BlockReceived, BscTiming, Event, Failed, Message, Received, Sent
+from frictid_drivers.motoman.bsc import BlockReceived, BscLink, BscTiming, Event, Failed, Message, Received, Sent
 from frictid_drivers.motoman.controller_errors import BadReply, LinkError, controller_error
 from frictid_drivers.motoman.port import BytePort, Sink, unheard
 from frictid_hil.errors import FrictidError, HardwareError

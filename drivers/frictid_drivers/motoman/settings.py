@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields, replace
 from typing import Any, TypeVar
 
-from frictid_drivers.motoman.bsc_block import BscTiming
+from frictid_drivers.motoman.bsc import BscTiming
 from frictid_drivers.motoman.host_control import PROFILES
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.protocol.driver import Timing, unknown_options

@@ -381,8 +381,6 @@ class Axis:
 class _Ramp:
     """Constant deceleration from a speed to rest."""
 
-    __slots__ = ("_from_rad", "_from_rad_s", "_start_ns", "done", "end_ns", "rate_rad_s2")
-
     def __init__(self, start_ns: int, from_rad: float, from_rad_s: float, rate_rad_s2: float) -> None:
         self._start_ns, self._from_rad, self._from_rad_s = start_ns, from_rad, from_rad_s
         self.rate_rad_s2 = rate_rad_s2

@@ -59,10 +59,6 @@ class Emergency:
             self.present = tuple(other for other in self.present if other != code)
             self._publish(0, 0)
 
-    def forget(self) -> None:
-        """Power was off: nothing is present, nothing is said."""
-        self.present = ()
-
     def _publish(self, code: int, detail: int) -> None:
         register = 0
         for present in self.present:

@@ -275,7 +275,7 @@ class Servo:
         self.power.run_to(now_ns)
         self.dictionary.reset()
         self._sdo.reset()
-        self.emergency.forget()
+        self.emergency.present = ()
         self.power.boot()
         self._restart_communication()
         self._settle()
