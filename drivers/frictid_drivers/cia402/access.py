@@ -1,8 +1,4 @@
-"""Objects of one drive, whatever carries them: typed, read back after every write, errors that name joint and object.
-
-What was written and read back is remembered, so that configuring the next joint costs only what differs. How an object
-is asked for on the wire is a transport's (``sdo`` for CANopen).
-"""
+"""Objects of one drive, whatever carries them: typed, read back after every write, remembered, with telling errors."""
 
 from __future__ import annotations
 
@@ -69,8 +65,6 @@ class Drive(ABC):
         self._told_bits: dict[tuple[int, int], int] = {}
         self.quirks = NO_QUIRKS
 
-    # -- what a transport brings --------------------------------------------------------------------------------
-
     @abstractmethod
     def upload(self, index: int, sub: int) -> bytes:
         """The bytes of an object; ``Aborted`` where the drive says no, ``HardwareError`` where it does not answer."""
@@ -82,8 +76,6 @@ class Drive(ABC):
     @abstractmethod
     def answering_within(self, timeout_s: float) -> contextlib.AbstractContextManager[None]:
         """Wait for answers no longer than this meanwhile."""
-
-    # -- access -------------------------------------------------------------------------------------------------
 
     def learn(self, quirks: Quirks) -> None:
         """Take over what is known of this drive."""

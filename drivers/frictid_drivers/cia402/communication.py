@@ -1,7 +1,4 @@
-"""What CANopen itself wants of a drive: SYNC, heartbeats, PDO communication and mapping, as lists of writes.
-
-Another transport (CANopen over EtherCAT) has others in their place; the profile's own settings are in ``configure``.
-"""
+"""What CANopen itself wants of a drive (other transports have others): SYNC, heartbeats, PDOs, as lists of writes."""
 
 from __future__ import annotations
 

@@ -221,8 +221,6 @@ class Cycle:
         request = bytes([0x2B, 0x40, 0x60, 0x00, controlword, 0x00, 0x00, 0x00])
         self._send_whatever_happens(0x600 + self._nodes[at], request)
 
-    # -- sending ------------------------------------------------------------------------------------------------
-
     def _due(self, set_points: Sequence[SetPoint]) -> list[_Outgoing]:
         """What is sent in this cycle: every moving joint's frame, and one more that has changed."""
         position_units = self._decoder.position_units
@@ -298,8 +296,6 @@ class Cycle:
             "stays off unless its link was brought up with `restart-ms`",
         )
 
-    # -- receiving ----------------------------------------------------------------------------------------------
-
     def _receive(self) -> None:
         receive, now_ns, decoder = self._frames.receive, self._clock.now_ns, self._decoder
         end_ns = self._window_end_ns
@@ -340,8 +336,6 @@ class Cycle:
                 if not self._decoder.feed(t_ns, cob_id, data):
                     self._other(cob_id, bytearray(data), arrived_s)
             self._late.clear()
-
-    # -- watchdogs ----------------------------------------------------------------------------------------------
 
     def _check(self, now_ns: int) -> None:
         decoder = self._decoder

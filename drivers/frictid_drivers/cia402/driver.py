@@ -1,10 +1,4 @@
-"""The CiA-402 driver: one CAN bus, one drive per joint, the driver protocol on top.
-
-This file is the life cycle; what it does at each step lives next door: ``settings`` (the robot file's options),
-``network`` and ``sdo`` (the wire and its objects), ``fleet`` (all drives, reached), ``facts`` (what a drive says of
-itself), ``layout`` and ``bus_load`` (which frames, and whether they fit), ``configure`` (writing and reading back),
-``cycle`` and ``axis`` (the exchange), ``codec`` (bytes to figures), ``inspection`` (``identify`` and ``check``).
-"""
+"""The CiA-402 driver: one CAN bus, one drive per joint. This file is the life cycle; its neighbours do each step."""
 
 from __future__ import annotations
 
@@ -82,8 +76,6 @@ class Cia402Driver:
         self._cycle: Cycle | None = None
         self.may_be_powered: tuple[str, ...] = ()
 
-    # -- reaching the drives ------------------------------------------------------------------------------------
-
     def open(self, frame_sink: FrameSink | None = None) -> None:
         """Take the bus exclusively and hear from every drive; reads only."""
         self._sink = frame_sink
@@ -157,8 +149,6 @@ class Cia402Driver:
             if reentry.standing_fault(drive) is not None:
                 reentry.bring_back(drive, partial(fleet.nmt_to, drive.node_id))
 
-    # -- configuring --------------------------------------------------------------------------------------------
-
     def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
         """Write and read back everything for this rate; ``active`` joints report on every SYNC.
 
@@ -204,8 +194,6 @@ class Cia402Driver:
     def frame_map_values(self) -> Mapping[str, Any]:
         """The same as plain values (``driver.FrameMapped``)."""
         return self.frame_map().to_mapping()
-
-    # -- cycling ------------------------------------------------------------------------------------------------
 
     def start_cycling(self) -> None:
         """All drives operational, run time zero. No SDO from here on, and no thread but the caller's."""
@@ -339,8 +327,6 @@ class Cia402Driver:
             if status is None or drive_state(status) not in _OFF:
                 powered.append(name)
         return tuple(powered)
-
-    # -- parts --------------------------------------------------------------------------------------------------
 
     def _reached(self) -> Fleet:
         if self._fleet is None:

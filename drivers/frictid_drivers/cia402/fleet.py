@@ -88,8 +88,6 @@ class Fleet:
         """The host's own heartbeat while nobody cycles."""
         self.wire.send_message(HEARTBEAT_BASE + self._settings.host_node, PRE_OPERATIONAL_STATE)
 
-    # -- layouts ------------------------------------------------------------------------------------------------
-
     def layout(self, active: Sequence[str], cycle_hz: float) -> Layout:
         """The frames for a rate and a set of joints that report on every SYNC."""
         return plan_layout(
@@ -133,8 +131,6 @@ class Fleet:
             temperature=settings.temperature_object,
             digital_inputs=settings.digital_inputs,
         )
-
-    # -- writing ------------------------------------------------------------------------------------------------
 
     def configure(self, active: Sequence[str], cycle_hz: float) -> tuple[Layout, FrameMap]:
         """Write a layout and all that makes it safe to every drive; returns it, and its frames as read back.

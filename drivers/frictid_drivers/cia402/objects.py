@@ -1,7 +1,4 @@
-"""The objects of CiA 301 and CiA 402 that this driver touches: index, sub-index, type and what each means.
-
-Addressed by index and never by name, because the names in vendors' EDS files differ.
-"""
+"""Objects of CiA 301 and CiA 402 that this driver touches, by index: the names in vendors' EDS files differ."""
 
 from __future__ import annotations
 

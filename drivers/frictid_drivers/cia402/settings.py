@@ -1,47 +1,6 @@
 """The settings of a robot file that this driver reads, checked before anything is opened.
 
-======================================  ========  =====================================================================
-options (robot)                         default   meaning
-======================================  ========  =====================================================================
-bitrate                                 1000000   bit/s; also the base of the bus load
-fd                                      false     PDOs are CAN FD frames with bit-rate switch, all else classical
-data_bitrate                            2000000   bit/s of the data of CAN FD frames
-pdo_bytes                               64        how long the drives' PDOs may be where they are CAN FD frames
-sdo_timeout_s                           0.5       how long a drive may take to answer
-watchdog_ms                             150       the drive stops when our heartbeat is missing for this long (1016)
-drive_heartbeat_ms                      100       heartbeat period of the drives (1017); 2.5 of it missing is a stop
-host_node                               127       our own node id
-reply_window                            0.7       share of the cycle in which reports must have come
-allow_torque_without_watchdog           false     torque modes on drives without 1016 and 6007
-quick_stop_option                       6         605A: 5, 6 or 7 (stop and hold)
-abort_option                            3         6007: 2 (disable voltage) or 3 (quick stop)
-faults                                  -         on a bus ``faulty:INTERFACE:CHANNEL``: what goes wrong on it
-tty_baudrate, port, host, tcp_tune, ... -         handed to the python-can interface as they are (``network.FORWARDED``)
-======================================  ========  =====================================================================
-
-======================================  ========  =====================================================================
-options (joint)                         default   meaning
-======================================  ========  =====================================================================
-following_window_rad                    0.12      6065 of the joint that moves
-locked_window_rad                       0.009     6065 of joints that stand locked
-following_timeout_ms                    20        6066
-standstill_rad_s                        0.02      speed below which the joint stands
-external_torque_object                  -         force sensor, e.g. ``"2030:00 i32"``
-external_torque_nm_per_unit             -         what its unit is worth, joint side
-temperature_object                      -         e.g. ``"2031:00 i16"``
-temperature_c_per_unit                  -         what its unit is worth
-digital_inputs                          false     60FD is reported at least every 10 ms (an interlock hangs there)
-position_units_per_revolution           -         of the joint; where 6092 and 608F do not tell
-velocity_unit_rad_s                     -         joint side; where 60A9 does not tell
-rated_torque_side                       motor     6076 is ``motor`` or ``joint`` side
-torque_source                           -         what the reported torque is, for the profile
-timing                                  -         position_delay_s, velocity_delay_s, torque_delay_s, uncertainty_s;
-                                                  torque_lag_s: what of torque_delay_s is a low-pass
-eds                                     -         the maker's EDS file: what can be written and mapped (check)
-raise_torque_limit                      false     6072 may be raised to the robot file's ``max_torque_nm``
-widen_position_limits                   false     607D may be widened to the robot file's limits
-fd_object                               -         e.g. ``"2023:00 u8"``: 1 makes the drive's PDOs CAN FD frames, 0 not
-======================================  ========  =====================================================================
+docs/reference/canopen-settings.md has the usual values.
 """
 
 from __future__ import annotations
@@ -62,19 +21,19 @@ from frictid_hil.protocol.driver import Timing, unknown_options
 
 @dataclass(frozen=True, slots=True)
 class BusSettings:
-    """Robot-wide settings; see the module's table."""
+    """Of the whole bus."""
 
-    bitrate: int
-    data_bitrate: int | None
-    pdo_bytes: int
-    sdo_timeout_s: float
-    watchdog_ms: int
-    drive_heartbeat_ms: int
-    host_node: int
-    reply_window: float
-    allow_torque_without_watchdog: bool
-    quick_stop_option: int
-    abort_option: int
+    bitrate: int  # bit/s
+    data_bitrate: int | None  # bit/s of the data of CAN FD frames; None on a classical bus
+    pdo_bytes: int  # how long the drives' PDOs may be
+    sdo_timeout_s: float  # how long a drive may take to answer
+    watchdog_ms: int  # the drive stops when our heartbeat is missing for this long (1016)
+    drive_heartbeat_ms: int  # heartbeat period of the drives (1017)
+    host_node: int  # our own node id
+    reply_window: float  # share of the cycle in which reports must have come
+    allow_torque_without_watchdog: bool  # torque modes on drives without 1016 and 6007
+    quick_stop_option: int  # 605A: 5, 6 or 7 (stop and hold)
+    abort_option: int  # 6007: 2 (disable voltage) or 3 (quick stop)
 
     @property
     def rates(self) -> BitRates:
@@ -94,23 +53,23 @@ class BusSettings:
 
 @dataclass(frozen=True, slots=True)
 class JointSettings:
-    """Settings of one joint; see the module's table."""
+    """Of one joint."""
 
-    following_window_rad: float
-    locked_window_rad: float
-    following_timeout_ms: int
-    standstill_rad_s: float
-    external_torque_object: Entry | None
-    external_torque_nm_per_unit: float
-    temperature_object: Entry | None
-    temperature_c_per_unit: float
-    digital_inputs: bool
-    torque_source: str
+    following_window_rad: float  # 6065 of the joint that moves
+    locked_window_rad: float  # 6065 of joints that stand locked
+    following_timeout_ms: int  # 6066
+    standstill_rad_s: float  # speed below which the joint stands
+    external_torque_object: Entry | None  # force sensor, e.g. ``"2030:00 i32"``
+    external_torque_nm_per_unit: float  # what its unit is worth, joint side
+    temperature_object: Entry | None  # e.g. ``"2031:00 i16"``
+    temperature_c_per_unit: float  # what its unit is worth
+    digital_inputs: bool  # 60FD is reported at least every 10 ms (an interlock hangs there)
+    torque_source: str  # what the reported torque is, for the profile
     timing: Timing | None
-    fd_object: Object | None
-    eds: Path | None = None
-    raise_torque_limit: bool = False
-    widen_position_limits: bool = False
+    fd_object: Object | None  # 1 makes the drive's PDOs CAN FD frames, 0 not
+    eds: Path | None = None  # the maker's EDS file: what can be written and mapped (check)
+    raise_torque_limit: bool = False  # 6072 may be raised to the robot file's ``max_torque_nm``
+    widen_position_limits: bool = False  # 607D may be widened to the robot file's limits
 
 
 BUS_OPTIONS = frozenset({one.name for one in fields(BusSettings)} | {"fd", "faults", *FORWARDED})

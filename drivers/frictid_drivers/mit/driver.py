@@ -1,9 +1,4 @@
-"""The driver for MIT-mode actuators: one CAN bus, one frame out and one back per joint and cycle.
-
-This file is the life cycle. ``frames`` and ``families`` know the bytes, ``models`` the ranges, ``settings`` the
-options, ``actuator`` one joint; ``protocol.wishes`` knows what is asked of a joint, ``protocol.rows`` which report
-belongs to which cycle.
-"""
+"""The driver for MIT-mode actuators: one CAN bus, one frame out and one back per joint and cycle. Its life cycle."""
 
 from __future__ import annotations
 
@@ -77,8 +72,6 @@ class MitDriver:
         self._cycle: CanCycle | None = None
         self.may_be_powered: tuple[str, ...] = ()
 
-    # -- reaching them ------------------------------------------------------------------------------------------
-
     def open(self, frame_sink: FrameSink | None = None) -> None:
         """Take the bus and hear from every motor. Families that answer nothing else are told `off`."""
         try:
@@ -124,8 +117,6 @@ class MitDriver:
             subject = f"joint {joint.name}"
             findings += [Finding(severity, subject, *said) for severity, *said in self._joint_findings(joint)]
         return findings
-
-    # -- configuring --------------------------------------------------------------------------------------------
 
     def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
         """Mode and watchdog written and read back; every joint reports in every cycle, active or not.
@@ -180,8 +171,6 @@ class MitDriver:
     def frame_map_values(self) -> Mapping[str, Any]:
         """As ``driver.FrameMapped``: with the ranges that are in force."""
         return frame_map_values(self.setup, self._settings)
-
-    # -- cycling ------------------------------------------------------------------------------------------------
 
     def start_cycling(self) -> None:
         """Run time zero."""
@@ -255,8 +244,6 @@ class MitDriver:
         self._restore.clear()
         self._line.close()
         self._line = None
-
-    # -- parts --------------------------------------------------------------------------------------------------
 
     def _open_line(self) -> CanLine:
         if self._line is None:

@@ -1,7 +1,4 @@
-"""The controller's own error numbers as exceptions that say what they mean.
-
-From public documents; ``90,000`` carries ``0000`` or one of these numbers.
-"""
+"""The controller's own error numbers (``90,000`` carries one, or ``0000``; public documents) as exceptions."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The serial driver: three layers behind the one driver protocol.
-
-Streaming is the cyclic exchange; batch is ``run_batch``; a stock controller without either can be looked at, and the
-findings say why it cannot be identified. The controller's interpolation clock is the run time of a stream.
-"""
+"""The serial driver: streaming as the cyclic exchange, batch as ``run_batch``, and stock controllers to look at."""
 
 from __future__ import annotations
 
@@ -82,8 +78,6 @@ class MotomanDriver:
         self.clock = TickClock(lock_step=port_factory is not None)
         self.batch_columns: dict[str, Any] = {}
 
-    # -- reaching it -------------------------------------------------------------------------------------------
-
     def open(self, frame_sink: FrameSink | None = None) -> None:
         """Take the port exclusively, reach the controller, find out which layer it can do. Nothing moves."""
         self._sink = frame_sink
@@ -118,8 +112,6 @@ class MotomanDriver:
         """Status, alarms, layers, limits of both sides, line load; reads only."""
         return inspection.findings(self._setup, self._units, self._options, self._reach, self._open_line().host, plan)
 
-    # -- preparing ---------------------------------------------------------------------------------------------
-
     def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
         """Choose the axes of the stream; ``PlanRefused`` where the controller cannot do this, or not at this rate."""
         if self._reach.layer == "host":
@@ -148,8 +140,6 @@ class MotomanDriver:
                 where=f"joint {joint}",
                 next_step="narrow `position_min_rad` and `position_max_rad` in the robot file",
             )
-
-    # -- cycling -----------------------------------------------------------------------------------------------
 
     def start_cycling(self) -> None:
         """Servo power on (the arm holds where it stands), then streaming; run time starts at the first tick.
@@ -237,8 +227,6 @@ class MotomanDriver:
             return
         finally:
             line.port.close()
-
-    # -- batch -------------------------------------------------------------------------------------------------
 
     def run_batch(
         self,
@@ -328,8 +316,6 @@ class MotomanDriver:
     def compensate_by_table(self, joints: Sequence[str]) -> None:
         """Apply the downloaded tables of these joints from now on; none ends it."""
         self._open_line().batch.compensate(self._mask(joints))
-
-    # -- inside ------------------------------------------------------------------------------------------------
 
     def _mask(self, joints: Iterable[str]) -> int:
         return sum(1 << self._units[name].axis for name in joints)

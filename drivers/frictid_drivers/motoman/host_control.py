@@ -103,8 +103,6 @@ class HostControl:
         self._owed = 0
         """Replies that may still come. They carry no name: a late one must not be taken for that of another command."""
 
-    # -- commands ----------------------------------------------------------------------------------------------
-
     def status(self, *, within_s: float | None = None) -> Status:
         """RSTATS."""
         return decode_status(self.profile, *self._figures("RSTATS", 2, within_s))
@@ -112,8 +110,6 @@ class HostControl:
     def pulses(self, *, within_s: float | None = None) -> list[int]:
         """RPOSJ: the joints' positions in pulses; axes that the robot lacks read 0."""
         return self._figures("RPOSJ", 12, within_s)
-
-    # -- how patient it is -------------------------------------------------------------------------------------
 
     @property
     def patience_s(self) -> float:
@@ -131,8 +127,6 @@ class HostControl:
             yield
         finally:
             self._link.retime(timing)
-
-    # -- the exchange ------------------------------------------------------------------------------------------
 
     def order(self, text: str, *, within_s: float | None = None) -> None:
         """A command that is answered by ``0000``; raises as ``ask`` does."""

@@ -45,10 +45,7 @@ class Reach:
 
 
 class Line:
-    """One port that is either in host control or in a stream, and what can be asked for on it.
-
-    ``port`` is open, at the speed of host control and with its ``parity``.
-    """
+    """One port, open at the speed of host control with its ``parity``: in host control or in a stream."""
 
     def __init__(self, port: BytePort, options: SerialOptions, parity: str, tick_us: int, sink: Sink) -> None:
         self.port = port

@@ -1,7 +1,4 @@
-"""A serial port as the layers above need it: bytes out, bytes in within a time, and the time itself.
-
-``SerialPort`` is the real one. Tests and the lock-step emulator bring their own, on virtual time.
-"""
+"""A serial port as the layers above need it: bytes out, bytes in within a time, and the time itself."""
 
 from __future__ import annotations
 

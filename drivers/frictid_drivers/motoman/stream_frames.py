@@ -180,10 +180,7 @@ def feedback_bytes(axes: int) -> int:
 
 
 class FrameReader:
-    """Finds frames in bytes that come in any portions.
-
-    A frame whose CRC is wrong costs one byte and the search goes on inside it, so that nothing behind it is lost.
-    """
+    """Finds frames in bytes that come in any portions; behind a wrong CRC the search goes on one byte further."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()

@@ -1,7 +1,4 @@
-"""A virtual bus on the wall clock belongs to one process at a time, as a real one would: locks, and where files live.
-
-In lock-step there is nothing to lock: the bus cannot be reached from outside its process.
-"""
+"""A virtual bus on the wall clock belongs to one process at a time, like a real one: locks, and where files live."""
 
 from __future__ import annotations
 

@@ -66,8 +66,6 @@ class VirtualDriver:
         self.enable, self.disable, self.lock, self.unlock = host.enable, host.disable, host.lock, host.unlock
         self.quick_stop = host.quick_stop
 
-    # -- life cycle ----------------------------------------------------------------------------------------------------
-
     def open(self, frame_sink: FrameSink | None = None) -> None:
         """Power the drives and reach them; on the wall clock, where others could reach them too, take the channel."""
         try:
@@ -120,8 +118,6 @@ class VirtualDriver:
     def capabilities(self) -> Capabilities:
         """What the host driver says of these drives, and whether time is theirs."""
         return replace(self._host.capabilities(), lock_step=not self._setup.realtime)
-
-    # -- what only a simulated robot can do ----------------------------------------------------------------------------
 
     def simulate_hand(
         self, joint: str, centre_rad: float = 0.0, amplitude_rad: float = 0.0, frequency_hz: float = 0.0

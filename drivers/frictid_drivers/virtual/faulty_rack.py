@@ -58,8 +58,6 @@ class FaultyRack(FaultSchedule):
         if self._pace != 1.0 and to_ns > self._host_ns:
             self._host_ns, self._drives_ns = to_ns, drives_ns
 
-    # -- frames --------------------------------------------------------------------------------------------------------
-
     def _to_drives(self, can_id: int, data: bytes, remote: bool) -> None:
         if not self._muted:
             self._rack.process(can_id, data, remote=remote)
@@ -84,8 +82,6 @@ class FaultyRack(FaultSchedule):
 
     def _to_host(self, can_id: int, data: bytes) -> None:
         self.transmit(can_id, data)
-
-    # -- drives --------------------------------------------------------------------------------------------------------
 
     def _switch(self, fault: Fault, joint: str, on: bool) -> None:
         servo = self._rack.servos[joint]

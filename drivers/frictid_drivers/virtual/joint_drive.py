@@ -1,8 +1,4 @@
-"""From one joint of a robot file to the drive that a supplier would have set up for it.
-
-The simulated joint becomes the plant; gear ratio, encoder, rated torque, limits and serial number become the power-on
-values of the objects that carry them.
-"""
+"""From one joint of a robot file to the drive that a supplier would have set up for it: plant and power-on values."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""The bus and the clock of lock-step: no thread, no wall clock, every reply there before ``send`` returns.
-
-``LockStepBus`` is the host's endpoint on python-can's virtual bus; a frame sent to it goes straight into the rack,
-whose replies are in the receive queue when ``send`` returns. ``LockStepClock`` lets run time pass only when somebody
-waits for it. Other members of the same virtual channel hear everything, as on any bus.
-"""
+"""The bus and the clock of lock-step: no thread, no wall clock, every reply there before ``send`` returns."""
 
 from __future__ import annotations
 
@@ -21,7 +16,7 @@ from frictid_hil.protocol.driver import FD_FRAME
 
 
 class LockStepBus(VirtualBus):
-    """The host's endpoint."""
+    """The host's endpoint on python-can's virtual bus; other members of its channel hear everything, as on any bus."""
 
     def __init__(self, drives: Rack | FaultyRack, channel: str = "frictid", **arguments: Any) -> None:
         arguments.setdefault("protocol", can.CanProtocol.CAN_FD)
@@ -76,7 +71,7 @@ class LockStepBus(VirtualBus):
 
 
 class LockStepClock:
-    """Run time of the drives on a lock-step bus; see ``frictid_hil.protocol.driver.Clock``."""
+    """Run time of the drives on a lock-step bus, which passes only while somebody waits; see ``driver.Clock``."""
 
     lock_step = True
 

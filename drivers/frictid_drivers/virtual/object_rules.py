@@ -1,7 +1,4 @@
-"""Which values objects take beyond the range of their type, and which objects belong together.
-
-Guards refuse with the abort codes of CiA 301. PDO parameters have theirs in ``pdo``; what a value does is the servo's.
-"""
+"""Which values objects take beyond the range of their type, and which belong together; ``pdo`` has those of PDOs."""
 
 from __future__ import annotations
 

@@ -98,8 +98,6 @@ class ProcessData:
             self._guard(0x1400 + number, 0x1600 + number, receive=True)
             self._guard(0x1800 + number, 0x1A00 + number, receive=False)
 
-    # -- life cycle ----------------------------------------------------------------------------------------------------
-
     def start(self, now_ns: int) -> None:
         """Entering NMT operational: counters restart, event-driven PDOs announce themselves."""
         self._running = True
@@ -172,8 +170,6 @@ class ProcessData:
             keys.append(0 if dummy else entry >> 8)
         return tuple(keys), struct.Struct(codes)
 
-    # -- traffic -------------------------------------------------------------------------------------------------------
-
     def due_on_sync(self, counter: int | None) -> list[TransmitPdo]:
         """Count one SYNC; the cyclic TPDOs to send now."""
         due = []
@@ -242,8 +238,6 @@ class ProcessData:
         if pdo.event_ns:
             pdo.timer_ns = now_ns + pdo.event_ns
         self._send(pdo.cob_id, pdo.last)
-
-    # -- configuration -------------------------------------------------------------------------------------------------
 
     def _guard(self, com: int, mapping: int, *, receive: bool) -> None:
         guards, effects = self._dictionary.guards, self._dictionary.effects

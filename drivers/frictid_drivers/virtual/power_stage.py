@@ -1,8 +1,4 @@
-"""The power stage of a drive: CiA 402's state machine at work on one axis - ramps, halt, faults, brake, statusword.
-
-``next_state`` says which transition a controlword asks for, ``PowerStage`` does to the motor what each one means.
-Transition numbers are those of the standard's figure.
-"""
+"""The power stage of a drive: CiA 402's state machine at work on one axis - ramps, halt, faults, brake, statusword."""
 
 from __future__ import annotations
 
@@ -147,8 +143,6 @@ class PowerStage:
             self.follow_commands()
         if self._enable_due_ns is not None and axis.now_ns >= self._enable_due_ns:
             self._follow_controlword(self._values[_K6040])
-
-    # -- commands ------------------------------------------------------------------------------------------------------
 
     def fault(self, code: int) -> None:
         """Transition 13: something is wrong; the fault reaction (605Eh) runs where the motor has power."""
@@ -321,8 +315,6 @@ class PowerStage:
     def apply_brake(self) -> None:
         """Work the brake as the power state and the outputs say."""
         self._plant.brake(self._brake_blocked or self._brake_wanted(self._axis.powered))
-
-    # -- readings ------------------------------------------------------------------------------------------------------
 
     def block_brake(self, blocked: bool) -> None:
         """The brake's coil breaks: it stays closed, whatever the drive says; or it is mended."""

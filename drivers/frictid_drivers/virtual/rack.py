@@ -129,10 +129,7 @@ class Rack:
 
 
 def couple(model: ArmModel, plants: Sequence[ServoLoop], axes: Sequence[Axis]) -> None:
-    """Put joints that stood alone on one arm, where what one link does the others feel: their axes move on together.
-
-    Each drive still looks at its joint only when something happens to it; whoever looks first brings all to now.
-    """
+    """Put joints on one arm, where what one link does the others feel: whoever looks at one first brings all to now."""
     arm = ArmLoop(model, plants)
 
     def advance(now_ns: int) -> None:

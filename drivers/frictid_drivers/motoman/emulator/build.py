@@ -1,8 +1,4 @@
-"""From a robot file to the controller that a supplier would have set up for it.
-
-Every joint's ``simulated`` mapping becomes the joint behind an axis; pulses per degree, gear ratio and limits become
-what the controller knows of the axis. ``options.emulator`` says what kind of controller it is.
-"""
+"""From a robot file to the controller that a supplier would have set up; ``options.emulator`` says which kind it is."""
 
 from __future__ import annotations
 

@@ -141,8 +141,6 @@ class BatchApplication:
             ticks = range(1, STOPPING_TICKS + 1)
             self._stopping = [round(issued + speed * (k - k * k / (2 * STOPPING_TICKS))) for k in ticks]
 
-    # -- the interpolation clock -------------------------------------------------------------------------------
-
     def tick(self, dropped: int) -> None:
         """One tick of a running job: latch, then issue the next command."""
         job = self._running
@@ -190,8 +188,6 @@ class BatchApplication:
         job.state = state
         self._stopping = None
         self._panel.operating = False
-
-    # -- commands ----------------------------------------------------------------------------------------------
 
     def _asked_for(self, number: int) -> Job:
         if self._job is None or self._job.number != number:

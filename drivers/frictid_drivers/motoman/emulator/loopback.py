@@ -7,10 +7,7 @@ from frictid_hil.errors import HardwareError
 
 
 class LoopbackPort:
-    """Looks like a serial port to a driver; time passes only while somebody reads.
-
-    At another speed or parity than the controller's, bytes are lost both ways.
-    """
+    """A serial port to a driver; time passes only while it reads, and at another speed or parity bytes are lost."""
 
     def __init__(self, emulator: Emulator, baud: int, parity: str) -> None:
         self.emulator = emulator

@@ -24,10 +24,7 @@ Line = tuple[int, str]  # speed and parity
 
 
 class Emulator:
-    """See the module's first page; the arm stands unpowered, and ``panel`` is what a person sees of it all.
-
-    ``on_guided`` is told when an axis is given into a person's hands, and taken back.
-    """
+    """The arm stands unpowered; ``on_guided`` is told when an axis is given into a person's hands, and taken back."""
 
     def __init__(
         self,
@@ -75,8 +72,6 @@ class Emulator:
         self._incoming.clear()
         self._outgoing.clear()
 
-    # -- what the wire sees ------------------------------------------------------------------------------------
-
     def hear(self, chunk: bytes) -> None:
         """The host puts bytes on the wire now; they arrive when the line has carried them."""
         if self.gone:
@@ -117,8 +112,6 @@ class Emulator:
             self.now_s = event_s
             self._happen()
         self.now_s = max(self.now_s, to_s)
-
-    # -- what happens ------------------------------------------------------------------------------------------
 
     def _happen(self) -> None:
         if self._incoming and self._incoming[0][0] <= self.now_s:
@@ -199,8 +192,6 @@ class Emulator:
         if self.stream is not None:
             self.stream.halt(reason)
 
-    # -- messages ----------------------------------------------------------------------------------------------
-
     def _message(self, header: str, text: str) -> None:
         """A whole message of the host: think about it, then reply."""
         self.batch.heard_host()
@@ -248,8 +239,6 @@ class Emulator:
         self._on_stream_line = False
         self.panel.operating = self.stream is not None and self.stream.moving
         self.station.reset(self.now_s)
-
-    # -- the voice of the station and of the stream ------------------------------------------------------------
 
     def say(self, kind: str, chunk: bytes) -> None:
         """Put an utterance on the wire, after the faults that strike it."""

@@ -1,7 +1,4 @@
-"""Everything about the controller that a person sees on its pendant: key switch, holds, alarms, servo power.
-
-``Panel`` also answers the stock host-control commands, in the controller's own words and numbers.
-"""
+"""Everything that a person sees on the pendant: key switch, holds, alarms, servo power; and the stock commands."""
 
 from __future__ import annotations
 
@@ -109,8 +106,6 @@ class Panel:
         """A hold is pressed, wired or commanded."""
         self.holds.add(which)
         self.on_stop("hold")
-
-    # -- stock commands ----------------------------------------------------------------------------------------
 
     def _rposj(self) -> Reply:
         require(self.position_known, 3070)

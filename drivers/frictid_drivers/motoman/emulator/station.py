@@ -85,8 +85,6 @@ class Station:
     def _note_wait(self, wait_s: float | None) -> None:
         self.deadline_s: float | None = None if wait_s is None else self._now_s + wait_s
 
-    # -- the story ---------------------------------------------------------------------------------------------
-
     def _life(self) -> Listening:
         while True:
             if self._outbox:

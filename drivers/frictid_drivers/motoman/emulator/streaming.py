@@ -80,8 +80,6 @@ class StreamApplication:
         """Targets are being followed, and hardly any time is left to the last of them."""
         return self._armed and not self._latched and self._last_due - self.tick_number <= _NEARLY_DRY
 
-    # -- the wire ----------------------------------------------------------------------------------------------
-
     def hear(self, chunk: bytes) -> None:
         """Bytes from the host."""
         self._heard += chunk
@@ -123,8 +121,6 @@ class StreamApplication:
             {HELLO: self._open, STOP: self._stop, SET_POINT: self._set_point}[kind](sequence, payload)
         except _Refused as refused:
             self._nack(sequence, *refused.args)
-
-    # -- sessions ----------------------------------------------------------------------------------------------
 
     def _open(self, sequence: int, payload: bytes) -> None:
         _require(len(payload) == 4, BAD_CRC)
@@ -176,8 +172,6 @@ class StreamApplication:
         if reason == "watchdog":
             self._panel.holds.add("command")
 
-    # -- set-points --------------------------------------------------------------------------------------------
-
     def _set_point(self, sequence: int, payload: bytes) -> None:
         count = len(self._moved)
         _require(count and len(payload) in (4 + 4 * count, 4 + 6 * count), BAD_SESSION)
@@ -212,8 +206,6 @@ class StreamApplication:
             plate = axis.plate
             allowed = plate.lowest <= target <= plate.highest and abs(target - before) <= plate.step * ticks
             _require(allowed, LIMIT, self._axes.index(axis), due)
-
-    # -- the interpolation clock -------------------------------------------------------------------------------
 
     def tick(self, dropped: int) -> None:
         """One tick: report what is, then issue what is due next."""
