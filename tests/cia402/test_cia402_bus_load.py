@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from frictid_drivers.cia402.bus_load import SyncFrame, bus_load, highest_rate_hz
-from frictid_drivers.cia402.layout import NodeWish, plan_layout
+from frictid_drivers.cia402.layout import NodeWish, SyncFrame, bus_load, highest_rate_hz, plan_layout
 from frictid_hil.protocol.can_load import FD_SIZES, BitRates, fd_frame_bits, fd_size, frame_bits
 
 SYNC = SyncFrame(0)

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from mit_bench import robot
 
-from frictid_drivers.mit.faulty_motors import KINDS
-from frictid_drivers.mit.simulated import VirtualMitDriver
+from frictid_drivers.mit.simulated import KINDS, VirtualMitDriver
 from frictid_drivers.virtual.faults import ENVIRONMENT
 from frictid_hil.errors import FrictidError, HardwareError, InvalidFields, SafetyAbort
 from frictid_hil.plan.mode import Mode

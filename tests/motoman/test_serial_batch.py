@@ -17,7 +17,7 @@ from frictid_drivers.motoman.batch import BatchClient, JobOrder, friction_table
 from frictid_drivers.motoman.batch_record import BlockCollector, JobRecord
 from frictid_drivers.motoman.controller_errors import FormatMistake, OperandOutOfRange, PendantHold, WrongMode
 from frictid_drivers.motoman.emulator import jobs
-from frictid_drivers.motoman.emulator.compensation import Compensator, Table
+from frictid_drivers.motoman.emulator.jobs import Compensator, Table
 from frictid_drivers.motoman.emulator.loopback import LoopbackPort
 from frictid_drivers.motoman.emulator.machine import Emulator
 from frictid_drivers.motoman.joint_units import AxisUnits

@@ -11,11 +11,10 @@ import canopen
 from frictid_drivers.cia402 import communication, configure
 from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.access import Drive, RefusedByDrive, Write
-from frictid_drivers.cia402.bus_load import BusLoad, highest_rate_hz
 from frictid_drivers.cia402.codec import HEARTBEAT_BASE
 from frictid_drivers.cia402.facts import Facts, read_facts
 from frictid_drivers.cia402.frame_map import FrameMap, JointFrames, joint_frames
-from frictid_drivers.cia402.layout import Layout, NodeWish, plan_layout
+from frictid_drivers.cia402.layout import BusLoad, Layout, NodeWish, highest_rate_hz, plan_layout
 from frictid_drivers.cia402.network import Node, SdoDrive, Wire
 from frictid_drivers.cia402.quirks import Catalogue, merged, quirks_of_eds
 from frictid_drivers.cia402.scale import Scale, raise_on_error, scale_of

@@ -7,12 +7,11 @@ from collections.abc import Iterator, Mapping
 
 from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.access import Drive
-from frictid_drivers.cia402.bus_load import BusLoad
 from frictid_drivers.cia402.configure import NEEDED
 from frictid_drivers.cia402.facts import Facts
 from frictid_drivers.cia402.fleet import Fleet
 from frictid_drivers.cia402.known_settings import Effect, read_settings, timing_of
-from frictid_drivers.cia402.layout import Layout
+from frictid_drivers.cia402.layout import BusLoad, Layout
 from frictid_drivers.cia402.scale import Scale, scale_of, velocity_unit_rad_s
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
 from frictid_drivers.cia402.state import DriveState, drive_state

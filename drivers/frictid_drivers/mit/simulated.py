@@ -3,28 +3,34 @@
 Written against the makers' frame tables and not against the driver: the two share no codec, only the catalogue of
 ranges. Numbers are truncated on the way out, as the makers' firmware does. The torque is the mean of what was applied,
 with the plant's noise, in the 12 or 16 bits of the family.
+
+Of the faults of ``virtual.faults``, ``frames`` is ``command`` or ``report`` here, ``level`` is in rad, rad/s or N m,
+and ``at_s`` counts from the first cycle.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import can
 
-from frictid_drivers.mit import faulty_motors
 from frictid_drivers.mit.driver import MitDriver
 from frictid_drivers.mit.frames import Ranges
 from frictid_drivers.mit.settings import JointSettings, read_settings
-from frictid_drivers.virtual.devices import Device, without_faults
-from frictid_drivers.virtual.faults import HOST_KINDS, faults_of
+from frictid_drivers.virtual.devices import DEVICE_KINDS, Device, DeviceFaults, without_faults
+from frictid_drivers.virtual.faults import HOST_KINDS, Fault, faults_of
 from frictid_drivers.virtual.faulty_bus import FaultyBus
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import FD_FRAME, Clock, WallClock
 from frictid_hil.testing.wire import Devices, FakeCanBus, Frame, ManualClock
 
+FRAMES = ("command", "report")
+KINDS = (*DEVICE_KINDS, *HOST_KINDS)
+_FAULT = 0xA
 _LONG_ID = 1 << 31
 _SERVICE_PORT = 0x7FF
 
@@ -35,13 +41,13 @@ class VirtualMitDriver(MitDriver):
     kind = replace(MitDriver.kind, simulated=True, line="virtual", elsewhere={"can": "mit"})
 
     def __init__(self, setup: RobotSetup) -> None:
-        faults = faults_of(setup, kinds=faulty_motors.KINDS, frames=faulty_motors.FRAMES)
+        faults = faults_of(setup, kinds=KINDS, frames=FRAMES)
         setup = without_faults(setup)
         self.rack = Rack(setup)
         self._begin: list[Callable[[], None]] = []
         motors: Devices = self.rack
         if faults:
-            motors = faulty = faulty_motors.FaultyMotors(self.rack, faults)
+            motors = faulty = FaultyMotors(self.rack, faults)
             self._begin.append(faulty.begin)
         clock: Clock = WallClock() if setup.realtime else ManualClock(motors.advance)
 
@@ -156,6 +162,44 @@ class Rack:
         """Run time goes on."""
         for actuator in self.actuators.values():
             actuator.advance(to_ns)
+
+
+class FaultyMotors(DeviceFaults):
+    """Motors whose wire, reports and power fail by a schedule; to the bus they look like any ``Rack``."""
+
+    def __init__(self, rack: Rack, faults: Sequence[Fault]) -> None:
+        super().__init__(faults, rack.actuators, rack.advance)
+        self._rack, self._answers = rack, list[Frame]()
+        self._muted: set[str] = set()
+
+    def receive(self, can_id: int, data: bytes) -> Iterable[Frame]:
+        """A frame of the host; what comes back now, and what was late and has come meanwhile."""
+        joint = self._rack.meant(can_id, data)
+        if joint is not None and joint not in self._muted:
+            for due_ns, out_id, out in self._spoilt("command", joint, can_id, data):
+                self._at(due_ns, partial(self._to_motor, joint, out_id, out))
+        answers = list(self._answers)
+        self._answers.clear()
+        return answers
+
+    def _to_motor(self, joint: str, can_id: int, data: bytes) -> None:
+        for answer in self._rack.receive(can_id, data):
+            for due_ns, out_id, out in self._spoilt("report", joint, *answer) if joint not in self._muted else ():
+                self._at(due_ns, partial(self._answers.append, (out_id, out)))
+
+    def _switch(self, fault: Fault, joint: str, on: bool) -> None:
+        motor = self._rack.actuators[joint]
+        match fault.kind:
+            case "mute":
+                (self._muted.add if on else self._muted.discard)(joint)
+            case "blocked":
+                motor.plant.brake(on)
+            case "reset" if on:
+                motor.fault, motor.timeout_ns = 0, 0
+                motor.switch(False)
+            case "fault" if on:
+                motor.fault = _FAULT
+                motor.switch(False)
 
 
 def _wire_of(settings: JointSettings, serial: int, data_bitrate: int | None) -> Wire:

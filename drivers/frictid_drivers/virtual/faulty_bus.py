@@ -19,7 +19,7 @@ from typing import Any
 import can
 
 from frictid_drivers.virtual.faults import HOST_KINDS, SERVICES, Fault, read_faults
-from frictid_drivers.virtual.wire_faults import SYNC_ID, FaultAtWork, Injections, Late, OccupiedWire, WireFaults
+from frictid_drivers.virtual.wire_faults import SYNC_ID, FaultAtWork, Late, OccupiedWire, WireFaults
 from frictid_hil.errors import InvalidFields
 
 _ERRORS: Mapping[str, Callable[[], Exception]] = {
@@ -53,7 +53,8 @@ class FaultyBus(can.BusABC):
         self._clock = now_ns
         self._start_ns: int | None = None
         self._outgoing, self._incoming = WireFaults(known), WireFaults(known)
-        self._injections = Injections(known)
+        injected = (fault for fault in known if fault.kind in ("reset", "emcy"))
+        self._injected = sorted(injected, key=lambda fault: fault.begin_s)
         self._at_work = {kind: [FaultAtWork(fault) for fault in known if fault.kind == kind] for kind in HOST_KINDS}
         self._stand_still = stand_still
         rates = [fault.level for fault in known if fault.kind == "occupied"]
@@ -142,14 +143,16 @@ class FaultyBus(can.BusABC):
         self._bus.shutdown()
 
     def _inject(self) -> None:
-        if self._start_ns is None:
-            return
-        to_drives, to_host = self._injections.take(self._elapsed_ns())
-        for can_id, data in to_drives:
-            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-        for can_id, data in to_host:
-            now_s = time.time()
-            self._received.append(can.Message(now_s, can_id, is_extended_id=False, data=data))
+        """Frames that nobody sent, in their time: resets and warnings, for a bus whose drives know no faults."""
+        while self._start_ns is not None and self._injected and self._injected[0].begin_s * 1e9 <= self._elapsed_ns():
+            fault = self._injected.pop(0)
+            for node in fault.nodes:
+                if fault.kind == "reset":
+                    self._bus.send(can.Message(arbitration_id=0x000, data=[0x81, node], is_extended_id=False))
+                    continue
+                for _ in range(fault.times):
+                    data = fault.code.to_bytes(2, "little") + b"\x81" + bytes(5)
+                    self._received.append(can.Message(time.time(), SYNC_ID + node, is_extended_id=False, data=data))
 
     def _fail(self, kind: str) -> None:
         for work in self._at_work[kind]:
@@ -174,12 +177,13 @@ def _described(faults: Sequence[Fault] | Sequence[Mapping[str, Any]] | None) -> 
             read += [fault] if isinstance(fault, Fault) else read_faults([fault], {})
     except InvalidFields as problem:
         raise can.CanInitializationError(f"options.faults: {problem}") from None
-    return [_unheard(fault) if fault.kind == "mute" else fault for fault in read]
-
-
-def _unheard(mute: Fault) -> Fault:
-    """A mute node as a cable sees it: none of its frames pass."""
-    return replace(mute, kind="drop", cob_ids=frozenset(base + node for base in _OF_A_NODE for node in mute.nodes))
+    # A mute node as a cable sees it: none of its frames pass.
+    return [
+        replace(fault, kind="drop", cob_ids=frozenset(base + node for base in _OF_A_NODE for node in fault.nodes))
+        if fault.kind == "mute"
+        else fault
+        for fault in read
+    ]
 
 
 def _changed(msg: can.Message, can_id: int, data: bytes) -> can.Message:

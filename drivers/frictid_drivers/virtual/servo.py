@@ -10,12 +10,12 @@ Written from the facts of CiA 301 and CiA 402 alone; it shares no code with the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import cast
 
 from frictid_drivers.virtual import emergency
 from frictid_drivers.virtual.axis import Axis
 from frictid_drivers.virtual.emergency import Emergency
-from frictid_drivers.virtual.heartbeat import Consumer, HeartbeatWatch
 from frictid_drivers.virtual.object_dictionary import ObjectDictionary, encode
 from frictid_drivers.virtual.object_rules import COMMANDS, HAND, NETWORK, UNITS, install_rules
 from frictid_drivers.virtual.objects import OBJECTS, STANDARD, Key, Manner, Record, Value, key
@@ -32,6 +32,47 @@ _SUPERVISION_NS = 10 * _MS
 _RAMP_TICK_NS = 1 * _MS
 
 Send = Callable[[int, bytes], None]
+
+
+@dataclass(slots=True)
+class Consumer:
+    """One node listened for."""
+
+    node: int
+    timeout_ns: int
+    deadline_ns: int | None = None  # when it counts as lost; None until it was heard
+    lost: bool = False  # it fell silent and has not been heard again
+
+
+class HeartbeatWatch:
+    """All nodes listened for (1016h): armed by the first heartbeat, lost when none came in time."""
+
+    def __init__(self) -> None:
+        self.consumers: list[Consumer] = []
+
+    def configure(self, entries: Iterable[int]) -> None:
+        """Take over the entries of 1016h; one that stays the same keeps its state."""
+        known = {(consumer.node, consumer.timeout_ns): consumer for consumer in self.consumers}
+        wanted = [(entry >> 16 & 0x7F, (entry & 0xFFFF) * _MS) for entry in entries]
+        self.consumers = [known.get(one) or Consumer(*one) for one in wanted if all(one)]
+
+    @property
+    def any_lost(self) -> bool:
+        """Somebody is missing."""
+        return any(consumer.lost for consumer in self.consumers)
+
+    @property
+    def deadlines_ns(self) -> list[int]:
+        """When those that were heard count as lost."""
+        return [consumer.deadline_ns for consumer in self.consumers if consumer.deadline_ns is not None]
+
+    def newly_lost(self, now_ns: int) -> list[int]:
+        """Nodes whose time has run out; each is told once."""
+        late = [one for one in self.consumers if one.deadline_ns is not None and now_ns >= one.deadline_ns]
+        for consumer in late:
+            consumer.deadline_ns = None
+            consumer.lost = True
+        return [consumer.node for consumer in late]
 
 
 class Servo:
@@ -89,7 +130,7 @@ class Servo:
                 key(0x1017): self._heartbeat_changed,
                 key(0x1019): self._counter_changed,
                 key(0x2023): self._pdo_changed,
-                key(0x2041): self._payload_changed,
+                key(0x2041): lambda: self._plant.mount_payload(bool(self._values[key(0x2041)])),
                 key(0x60FE, 2): self.power.apply_brake,
                 **dict.fromkeys(NETWORK, self._network_changed),
                 **dict.fromkeys(HAND, self._hand_changed),
@@ -395,6 +436,3 @@ class Servo:
     def _hand_changed(self) -> None:
         grip, centre, amplitude, frequency = (self._values[key(0x2040, sub)] for sub in (1, 2, 3, 4))
         self._hold_hand(bool(grip), centre * 1e-6, amplitude * 1e-6, frequency * 1e-3)
-
-    def _payload_changed(self) -> None:
-        self._plant.mount_payload(bool(self._values[key(0x2041)]))

@@ -217,28 +217,6 @@ class WrongFigure:
         return before + wrong.to_bytes(size, "little", signed=signed) + data[place.stop :]
 
 
-class Injections:
-    """Frames that nobody sent, in their time: resets and warnings, for a bus whose drives know no faults."""
-
-    def __init__(self, faults: Sequence[Fault]) -> None:
-        self._due = sorted(
-            (fault for fault in faults if fault.kind in ("reset", "emcy")), key=lambda fault: fault.begin_s
-        )
-
-    def take(self, elapsed_ns: float) -> tuple[list[tuple[int, bytes]], list[tuple[int, bytes]]]:
-        """What goes to the drives, and what to the host."""
-        to_drives, to_host = [], []
-        while self._due and self._due[0].begin_s * 1e9 <= elapsed_ns:
-            fault = self._due.pop(0)
-            for node in fault.nodes:
-                if fault.kind == "reset":
-                    to_drives.append((0x000, bytes([0x81, node])))
-                else:
-                    warning = fault.code.to_bytes(2, "little") + b"\x81" + bytes(5)
-                    to_host += [(SYNC_ID + node, warning)] * fault.times
-        return to_drives, to_host
-
-
 class OccupiedWire:
     """A wire on which frames, with the most stuff bits, take time; the lowest identifier that waits goes first."""
 

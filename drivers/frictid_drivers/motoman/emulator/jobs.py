@@ -8,11 +8,11 @@ from __future__ import annotations
 import base64
 import math
 import struct
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from frictid_drivers.motoman.emulator.compensation import Compensator, Table
 from frictid_drivers.motoman.emulator.panel import DONE, Panel, Refused, Reply, data, require
 
 SAMPLES_PER_BLOCK = 18
@@ -41,6 +41,59 @@ def crc16(raw: bytes) -> int:
     for byte in raw:
         register = (register << 8 & 0xFF00) ^ _SHIFTED[register >> 8 ^ byte]
     return register
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """What FTABLE brought for one axis: the curve at equal steps of speed from standstill, and what holds the joint.
+
+    Torques at the motor shaft in uN m, positions in pulses. The first point is F_0; beyond the last one the curve goes
+    on with the last slope.
+    """
+
+    ratio: float  # R, part of the friction that is compensated
+    step_tenths: float  # 0.1 pulse/s between two points
+    stiffness_micro: float  # K, uN m per pulse
+    turn_pulses: float  # pulses per revolution of the joint, for gravity
+    gravity_cos_micro: float  # uN m at the motor shaft
+    gravity_sin_micro: float  # uN m at the motor shaft
+    points_micro: tuple[int, ...]  # the curve
+
+    def curve_micro(self, speed_tenths: float) -> float:
+        """phi of a speed >= 0."""
+        place = speed_tenths / self.step_tenths
+        index = min(int(place), len(self.points_micro) - 2)
+        low, high = self.points_micro[index : index + 2]
+        return low + (high - low) * (place - index)
+
+
+class Compensator:
+    """The slip spring of one axis, (24a)-(24c), relaxed at ``pulses``, with its table on top; ``delay_ticks`` late."""
+
+    def __init__(self, table: Table, pulses: int, delay_ticks: int = 0) -> None:
+        self.table = table
+        self._under_way = deque([0.0] * delay_ticks)
+        self._pulses = pulses
+        self._stretch = 0.0
+
+    def torque_micro(self, pulses: int, speed_tenths: float, *, gravity: bool) -> float:
+        """Torque to add now, uN m; ``gravity`` adds what holds a floating axis."""
+        self._under_way.append(self._computed(pulses, speed_tenths, gravity=gravity))
+        return self._under_way.popleft()
+
+    def _computed(self, pulses: int, speed_tenths: float, *, gravity: bool) -> float:
+        table = self.table
+        coulomb = table.points_micro[0]
+        longest = coulomb / table.stiffness_micro
+        # (24a) with the increment of the encoder in place of v dt.
+        self._stretch = max(-longest, min(longest, self._stretch + pulses - self._pulses))
+        self._pulses = pulses
+        rate_part = math.copysign(table.curve_micro(abs(speed_tenths)) - coulomb, speed_tenths)
+        friction = table.ratio * (table.stiffness_micro * self._stretch + rate_part)
+        if not gravity:
+            return friction
+        angle = 2 * math.pi * pulses / table.turn_pulses
+        return friction + table.gravity_cos_micro * math.cos(angle) + table.gravity_sin_micro * math.sin(angle)
 
 
 @dataclass

@@ -195,13 +195,11 @@ class Emulator:
     def _message(self, header: str, text: str) -> None:
         """A whole message of the host: think about it, then reply."""
         self.batch.heard_host()
-        self._replies.append((self.now_s + self.settings.thinking_s, self._reply(header, text)))
-
-    def _reply(self, header: str, text: str) -> Reply:
         try:
-            return self._obey(header, text)
+            reply = self._obey(header, text)
         except Refused as refused:
-            return "90,000", f"{refused.args[0]:04d}"
+            reply = "90,000", f"{refused.args[0]:04d}"
+        self._replies.append((self.now_s + self.settings.thinking_s, reply))
 
     def _obey(self, header: str, text: str) -> Reply:
         command, _, rest = text.partition(" ")

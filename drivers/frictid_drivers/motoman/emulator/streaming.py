@@ -53,8 +53,7 @@ class StreamApplication:
         self._session = 0
         self._old_session = 0
         self._mask = 0
-        self._moved: list[Axis] = []
-        """Axes of the session, in the order of its frames."""
+        self._moved: list[Axis] = []  # axes of the session, in the order of its frames
         self._last_heard: int | None = None
         self._last_due = 0
         self._last_asked: list[int] = []
