@@ -165,17 +165,14 @@ class Cycle:
         return feedback
 
     def quick_stop(self) -> None:
-        """Send the stop to all joints, active ones first, from any thread; never raises and waits for nothing.
-
-        The frames take effect with the SYNC that follows them; a second round costs nothing and covers a lost one.
-        """
+        """Send the stop to all joints, active ones first, from any thread; never raises and waits for nothing."""
         frames: list[Command] = []
         for active in (True, False):
             for axis, is_active in zip(self._axes, self._active, strict=True):
                 if is_active is active:
                     primary, secondary = axis.emergency()
                     frames += [primary] if axis.mode is Mode.POSITION else [secondary, primary]
-        for _ in range(2):
+        for _ in range(2):  # they take effect with the SYNC that follows; a second round covers a lost one
             for frame in frames:
                 self._send_whatever_happens(frame.cob_id, frame.data, fd=self._fd)
             self._send_whatever_happens(SYNC_COB_ID, self._sync)

@@ -57,11 +57,7 @@ def read_settings(drive: Drive, vendor: int, product: int) -> dict[Setting, int]
 
 
 def timing_of(settings: dict[Setting, int], cycle_s: float) -> Timing | None:
-    """When reported figures were true, where the drive's filters are known; None where they are not.
-
-    The torque is that which was applied during the cycle before SYNC, on average half a cycle earlier; a first-order
-    low-pass delays by its time constant.
-    """
+    """When reported figures were true, where the drive's filters are known; None where they are not."""
     velocity_s, torque_s = (
         [value * 1e-6 for setting, value in settings.items() if setting.effect is effect]
         for effect in (Effect.VELOCITY_FILTER_US, Effect.TORQUE_FILTER_US)
@@ -71,6 +67,7 @@ def timing_of(settings: dict[Setting, int], cycle_s: float) -> Timing | None:
     return Timing(
         position_delay_s=0.0,
         velocity_delay_s=sum(velocity_s, 0.0),
+        # Applied during the cycle before SYNC; a first-order low-pass delays by its time constant.
         torque_delay_s=cycle_s / 2 + sum(torque_s, 0.0),
         torque_lag_s=sum(torque_s, 0.0),
         uncertainty_s=0.0002,

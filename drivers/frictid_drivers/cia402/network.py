@@ -186,10 +186,7 @@ class SdoDrive(Drive):
 
 
 class HeartbeatTimer:
-    """The host's heartbeat while nobody cycles: a small thread that survives send errors.
-
-    While cycling the exchange sends it; in lock-step, where time stands still outside the cycle, nobody needs to.
-    """
+    """The host's heartbeat while nobody cycles (the exchange sends its own): a thread that survives send errors."""
 
     def __init__(self, send: Callable[[], None], period_s: float) -> None:
         self._send = send

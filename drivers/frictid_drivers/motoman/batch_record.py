@@ -116,15 +116,12 @@ class JobRecord:
 
 
 class BlockCollector:
-    """Cuts the text of a reply into base64 blocks as it comes, and fills ``rows`` from every intact one of this job.
-
-    ``shifts`` are those of velocity and torque for the whole job; None where every block carries its own.
-    """
+    """Cuts the text of a reply into base64 blocks as it comes, and fills ``rows`` from every intact one of this job."""
 
     def __init__(self, number: int, rows: Rows, shifts: tuple[int, int] | None) -> None:
         self._number = number
         self._rows = rows
-        self._shifts = shifts
+        self._shifts = shifts  # of velocity and torque for the whole job; None where every block carries its own
         self._head_bytes = _HEAD.size + (_SHIFTS.size if shifts is None else 0)
         self._text = ""
 

@@ -152,10 +152,7 @@ Outcome = Sent | Failed | Yielded | None  # how the sending ended; None while it
 
 
 class Sender:
-    """One message on its way, once ``bid`` for; what to say is appended to ``output``.
-
-    ``expire`` must be called by ``deadline_s`` at the latest.
-    """
+    """One message on its way, once ``bid`` for, said into ``output``; call ``expire`` by ``deadline_s``."""
 
     def __init__(self, timing: BscTiming, output: bytearray) -> None:
         self.timing = timing
@@ -230,10 +227,7 @@ class Sender:
         return self._say(self._blocks[self._index], now_s)
 
     def _contention(self, now_s: float) -> Outcome:
-        """Both bid at once: hold on the first time, yield the second.
-
-        That ends it against a controller that yields at once as well as against one that never does.
-        """
+        """Both bid at once: hold on first, then yield; that ends it with those who yield at once, and who never do."""
         self._contentions += 1
         self.contended = True
         return self._garbled(now_s) if self._contentions == 1 else Yielded()
@@ -257,10 +251,7 @@ class Sender:
 
 
 class Receiver:
-    """The other side's messages, one after another; what to say, and what happens, is appended to the lists given.
-
-    ``expire`` must be called by ``deadline_s`` at the latest; the line is free again when it is ``over``.
-    """
+    """The other side's messages, answered and told into the lists until ``over``; ``expire`` by ``deadline_s``."""
 
     def __init__(self, timing: BscTiming, output: bytearray, events: list[Event]) -> None:
         self.timing = timing
@@ -347,10 +338,7 @@ class Receiver:
         self._broken = False
 
     def _break(self, byte: int, now_s: float) -> None:
-        """This block is lost: discard what comes until the line is quiet, then reject it.
-
-        A control code here may be a damaged byte of the block as well as the peer's impatience; the quiet tells.
-        """
+        """A block is lost: discard until the line is quiet, which tells a damaged byte from the peer's impatience."""
         self._broken = True
         self._last_broken_byte = byte
         self.deadline_s = min(now_s + self.timing.quiet_s, self._block_due_s)

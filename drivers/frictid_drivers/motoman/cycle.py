@@ -26,10 +26,7 @@ _KEEP_ALIVE_TICKS = 100
 
 
 class TickClock:
-    """Run time by the controller's ticks; see the module's first page. Zero while nothing streams.
-
-    Between jobs of a batch there are no ticks to go by: it is then the time on this side since ``start``.
-    """
+    """Run time by the controller's ticks, or by our clock since ``start`` (a batch has no ticks); zero while idle."""
 
     def __init__(self, *, lock_step: bool = False) -> None:
         self.lock_step = lock_step

@@ -142,12 +142,9 @@ class MotomanDriver:
             )
 
     def start_cycling(self) -> None:
-        """Servo power on (the arm holds where it stands), then streaming; run time starts at the first tick.
-
-        In batch, power stays on from here on, between the jobs as well, and run time starts now.
-        """
+        """Servo power on (the arm holds where it stands), then streaming; run time starts at the first tick."""
         line = self._open_line()
-        if self._reach.layer == "batch":
+        if self._reach.layer == "batch":  # power stays on, between the jobs as well, and run time starts now
             line.power.on()
             self._batching = True
             self.clock.start(line.port.now_s)
@@ -196,10 +193,7 @@ class MotomanDriver:
         line.power.off()
 
     def quick_stop(self) -> None:
-        """Stop. A stream is told without waiting; a job by host control, whose handshake may take half a second.
-
-        In both cases our silence afterwards lets the controller's own watchdog stop the arm.
-        """
+        """Tell a stream at once, a job within half a second; our silence lets the controller's watchdog act too."""
         with contextlib.suppress(FrictidError):
             if self._cycle is not None:
                 self._cycle.session.halt()
@@ -273,10 +267,7 @@ class MotomanDriver:
         return self.batch_columns
 
     def standing(self, *, within_s: float | None = None) -> Sequence[Feedback]:
-        """Every joint as stock host control sees it: position and state, no velocity and no torque; about 0.1 s.
-
-        ``within_s`` bounds each of the two questions.
-        """
+        """Every joint as host control sees it, position and state alone, each asked ``within_s``; about 0.1 s."""
         host = self._open_line().host
         status, pulses = host.status(within_s=within_s), host.pulses(within_s=within_s)
         state = JointState.ENABLED if status.servo_on else JointState.DISABLED

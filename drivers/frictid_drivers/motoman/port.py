@@ -48,10 +48,7 @@ class BytePort(Protocol):
 
 
 class SerialPort:
-    """A serial port of this machine, held exclusively; its parity is never changed silently.
-
-    ``HardwareBusy`` where another process holds it, ``HardwareError`` where it cannot be opened like this.
-    """
+    """A port of this machine, held exclusively, its parity as told; ``HardwareBusy`` or ``HardwareError`` otherwise."""
 
     def __init__(self, path: str, baud: int, parity: str) -> None:
         self._path = path

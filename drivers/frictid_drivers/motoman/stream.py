@@ -169,10 +169,7 @@ class StreamSession:
         return SafetyAbort(what, where="controller", cause=cause, next_step=next_step)
 
     def halt(self, *, leave: bool = False) -> None:
-        """STOP, several times over; the session is dead after it.
-
-        It waits for nothing but, with ``leave`` (the line goes back to host control), a moment for the goodbye.
-        """
+        """STOP, several times over; waits for nothing but, with ``leave`` to host control, a moment for the goodbye."""
         self.halted = True
         for _ in range(_STOP_REPEATS):
             self._seq = (self._seq + 1) & 0xFFFF

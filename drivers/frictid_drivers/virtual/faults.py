@@ -142,10 +142,7 @@ ENVIRONMENT = "FRICTID_VIRTUAL_FAULTS"
 def faults_of(
     setup: RobotSetup, *, kinds: tuple[str, ...] = KINDS, frames: tuple[str, ...] = tuple(SERVICES)
 ) -> tuple[Fault, ...]:
-    """The faults of a robot file and of the environment: of kinds that its drives know, and frames on its wire.
-
-    ``InvalidFields`` where the list is wrong, ``UsageError`` where the environment's is not JSON.
-    """
+    """Faults of robot file and environment, of these kinds and frames; ``InvalidFields``, ``UsageError`` (no JSON)."""
     text = os.environ.get(ENVIRONMENT, "")
     try:
         further = json.loads(text) if text else None
@@ -162,10 +159,7 @@ def faults_of(
 def read_faults(
     rows: Any, nodes: Mapping[str, int], *, kinds: tuple[str, ...] = KINDS, frames: tuple[str, ...] = tuple(SERVICES)
 ) -> tuple[Fault, ...]:
-    """The list under ``options.faults``, None for none, of these joints (with their nodes), kinds and frames.
-
-    ``InvalidFields`` tells what is wrong, by ``options.faults.N.KEY``.
-    """
+    """The list under ``options.faults``, or None, of these joints, kinds and frames; ``InvalidFields`` by its keys."""
     top = Fields({})
     top.path = ("options", "faults")
     faults: list[Fault] = []

@@ -27,14 +27,10 @@ def servo_for(
     plant: ServoLoop,
     send: Send,
     *,
-    missing: Iterable[int] = (),
-    sync_gap_tenths: int = 20,
+    missing: Iterable[int] = (),  # indices of objects that it does not have
+    sync_gap_tenths: int = 20,  # longest tolerated gap between SYNCs, in tenths of the period (2010h:01)
 ) -> Servo:
-    """The drive of one joint, unpowered, its brake engaged, standing at the start position.
-
-    ``missing``: indices of objects that it does not have; ``sync_gap_tenths``: longest tolerated gap between SYNCs, in
-    tenths of the period (2010h:01).
-    """
+    """The drive of one joint, unpowered, its brake engaged, standing at the start position."""
     model = plant.model
     gear = Fraction(joint.gear_ratio).limit_denominator(1000)
     counts = Fraction(model.encoder.counts_per_revolution).limit_denominator(1)

@@ -43,14 +43,13 @@ class Rack:
         self,
         setup: RobotSetup,
         *,
-        missing: Mapping[str, frozenset[int]] | None = None,
-        sync_gap_tenths: int = SYNC_GAP_TENTHS,
+        missing: Mapping[str, frozenset[int]] | None = None,  # indices of objects that drives do not have, by joint
+        sync_gap_tenths: int = SYNC_GAP_TENTHS,  # longest tolerated gap between SYNCs, in tenths of the period
     ) -> None:
         """Build the drives of a robot file in; they have no power yet.
 
-        ``missing``: indices of objects that drives do not have, by joint; ``sync_gap_tenths``: longest gap between
-        SYNCs that drives tolerate, in tenths of the period. ``InvalidFields`` where a joint's ``simulated`` mapping, or
-        ``simulated_arm``, is wrong; ``ConfigError`` without the library that a simulated arm needs.
+        ``InvalidFields`` where a joint's ``simulated`` mapping, or ``simulated_arm``, is wrong; ``ConfigError`` without
+        the library that a simulated arm needs.
         """
         arm = arm_of(setup)
         plants = [plant_for(setup, joint) for joint in setup.joints]

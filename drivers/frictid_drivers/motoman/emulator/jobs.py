@@ -118,11 +118,7 @@ class Job:
 
 
 class BatchApplication:
-    """FHELLO, FJOB, FRUN, FSTAT, FSTOP, FREAD, FTABLE, FTREAD, FCOMP.
-
-    ``on_guided`` is told when an axis is given into a person's hands, and taken back; ``compensated`` is the mask of
-    axes whose table is applied every tick.
-    """
+    """FHELLO, FJOB, FRUN, FSTAT, FSTOP, FREAD, FTABLE, FTREAD, FCOMP; ``on_guided`` as in ``Emulator``."""
 
     def __init__(self, panel: Panel, on_guided: Callable[[int, bool], None]) -> None:
         self._panel = panel
@@ -132,7 +128,7 @@ class BatchApplication:
         self._job: Job | None = None
         self._tables: dict[int, tuple[bytes, Table]] = {}
         self._compensators: dict[int, Compensator] = {}
-        self.compensated = 0
+        self.compensated = 0  # mask of axes whose table is applied every tick
         self._unheard_ticks = 0
         self._overload_ticks = 0
         self._stopping: list[int] | None = None

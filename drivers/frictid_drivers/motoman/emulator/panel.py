@@ -27,10 +27,7 @@ def data(text: str) -> Reply:
 
 
 class Panel:
-    """State of the controller and its stock commands.
-
-    ``on_stop`` is called when motion must end at once, and told why.
-    """
+    """State of the controller and its stock commands; ``on_stop`` is told why motion must end at once."""
 
     def __init__(self, axes: Sequence[Axis], settings: Settings, on_stop: Callable[[str], None]) -> None:
         self.axes = list(axes)

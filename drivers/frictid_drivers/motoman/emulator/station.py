@@ -36,11 +36,7 @@ class Voice(Protocol):
 
 
 class Station:
-    """Answers the host's messages and sends the controller's own.
-
-    ``on_message`` is told header and text (without CR) of every whole message; ``deadline_s`` says when ``tick`` is
-    wanted, None while only bytes matter.
-    """
+    """Answers the host's messages, tells ``on_message`` header and text of each, and sends the controller's own."""
 
     def __init__(self, settings: Settings, voice: Voice, on_message: Callable[[str, str], None]) -> None:
         self._p = settings
@@ -83,6 +79,7 @@ class Station:
         self._note_wait(self._story.send(byte))
 
     def _note_wait(self, wait_s: float | None) -> None:
+        # When ``tick`` is wanted; None while only bytes matter.
         self.deadline_s: float | None = None if wait_s is None else self._now_s + wait_s
 
     def _life(self) -> Listening:
