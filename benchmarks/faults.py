@@ -22,12 +22,14 @@ import contextlib
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import tempfile
 import time
 import traceback
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache, partial
@@ -134,10 +136,11 @@ SERVO_RATES_HZ = (200.0,)
 """Servos are to be kept to it (docs/guides/servos.md)."""
 REST_S, OFF_S, OFF_RAD_S = 0.5, 2.6, 0.02
 """Longest from the host's stop to rest and to the end of power (docs/reference/stops.md), and what counts as rest."""
-SILENT_S = 1.0
-"""Nobody talks to the drives for so long: their own watchdogs have had their say."""
-STANDS_S = 0.2
-"""Who stands has gone no way within this time: a loop under power has noise in its speed."""
+SILENT_S, LOOK_S = 1.0, 0.005
+"""Nobody talks to the drives for so long: their own watchdogs have had their say. They are looked at so often."""
+STANDS_S = 0.02
+"""Who stands has gone no way within this time: a loop that holds a joint at an edge of its encoder has a speed, but the
+joint goes nowhere."""
 MARGIN = 0.02
 BEFORE_SYNC = ("preflight", "configure")
 HANGS_S = 120
@@ -446,7 +449,7 @@ def _axle(joint: JointSetup, powered: Callable[[], bool], plant: Any, *, watchdo
         joint.name,
         powered,
         lambda: float(plant.position_rad),
-        lambda: float(plant.velocity_rad_s),
+        lambda: float(plant.true_velocity_rad_s),
         (joint.position_min_rad, joint.position_max_rad),
         joint.max_velocity_rad_s,
         watchdog,
@@ -463,10 +466,12 @@ class Watched(Silent):
         self.rings: list[Ring] = []
         self.phases: dict[str, Phase] = {}
         self.stop_ns: int | None = None
-        self.moved_ns = self.powered_ns = 0
+        self.moved_ns = 0
+        self.powered_ns: dict[str, int] = {}  # by joint, when it had power last
         self.origin_ns: int | None = None
         self.answers = 0
         self.beyond: dict[str, str] = {}
+        self._places: dict[str, deque[tuple[int, float]]] = {}  # by joint, of the last STANDS_S under power
         self._phase = "preflight"
         self.phases["preflight"] = Phase(0.0)
 
@@ -616,18 +621,28 @@ class Watched(Silent):
     def _advanced(self) -> None:
         for axle in self.axles:
             if axle.powered():
-                self.powered_ns = self.now()
+                self.powered_ns[axle.name] = self.now()
                 self._look(axle)
+            else:
+                self._places.pop(axle.name, None)
 
     def _look(self, axle: Axle) -> None:
-        speed = abs(axle.velocity_rad_s())
-        if speed > OFF_RAD_S:
+        if self.moves(axle):
             self.moved_ns = self.now()
             low, high = axle.within_rad
             if not low <= axle.position_rad() <= high:
                 self.beyond.setdefault("limits", f"joint {axle.name} left its limits")
-            if speed > axle.fastest_rad_s:
+            if abs(axle.velocity_rad_s()) > axle.fastest_rad_s:
                 self.beyond["speed"] = f"joint {axle.name} passed its highest speed"
+
+    def moves(self, axle: Axle) -> bool:
+        """It went further within ``STANDS_S`` than who is at rest goes; to be asked whenever time has gone on."""
+        now_ns, places = self.now(), self._places.setdefault(axle.name, deque())
+        places.append((now_ns, axle.position_rad()))
+        while len(places) > 2 and places[1][0] <= now_ns - STANDS_S * 1e9:
+            places.popleft()
+        reached = [place for _, place in places]
+        return max(reached) - min(reached) > OFF_RAD_S * STANDS_S
 
 
 def _usual_hz(kind: str) -> float:
@@ -834,25 +849,33 @@ def _told(verdict: Verdict, result: Mapping[str, Any]) -> None:
 # -- the judgement -----------------------------------------------------------------------------------------------------
 
 
+def _holds(axle: Axle, verdict: Verdict) -> bool:
+    """Without a watchdog, out of reach, and named in the last words: it keeps its power and its last goal."""
+    named = re.search(r"joint ([^:;]+) may still have power", verdict.said)
+    told = named is not None and axle.name in named[1].split(", ")
+    return told and not axle.watchdog and verdict.name in OUT_OF_REACH
+
+
 def _judge_drives(watched: Watched, verdict: Verdict) -> None:
     rack = watched.rack
     if rack is None:
         return
-    rack.advance(watched.now() + round(SILENT_S * 1e9))
-    before_rad = [axle.position_rad() for axle in watched.axles]
-    rack.advance(watched.now() + round(STANDS_S * 1e9))
-    for axle, was_rad in zip(watched.axles, before_rad, strict=True):
+    for _ in range(round(SILENT_S / LOOK_S)):
+        rack.advance(watched.now() + round(LOOK_S * 1e9))
+    for axle in watched.axles:
         if axle.powered():
-            told = "supply" in verdict.said or "may still" in verdict.said
-            if axle.watchdog or verdict.name not in OUT_OF_REACH or not told:
+            if _holds(axle, verdict):
+                watched.powered_ns.pop(axle.name)  # no word reaches it, so that there is no time to hold it to
+            else:
                 verdict.failures.append(f"joint {axle.name} has power after the end")
-            if abs(axle.position_rad() - was_rad) > OFF_RAD_S * STANDS_S:
+            if watched.moves(axle):
                 verdict.failures.append(f"joint {axle.name} moves after the end")
     verdict.failures += watched.beyond.values()
     if watched.stop_ns is not None:
         verdict.noticed = True
         verdict.rest_s = round(max(0, watched.moved_ns - watched.stop_ns) * 1e-9, 3)
-        verdict.off_s = round(max(0, watched.powered_ns - watched.stop_ns) * 1e-9, 3)
+        off_ns = max(watched.powered_ns.values(), default=0)
+        verdict.off_s = round(max(0, off_ns - watched.stop_ns) * 1e-9, 3)
         if verdict.rest_s > REST_S:
             verdict.failures.append(f"at rest {verdict.rest_s:.2f} s after the stop")
         if verdict.off_s > OFF_S:

@@ -3,6 +3,7 @@
 import importlib.util
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -30,6 +31,13 @@ WITHOUT_POWER = [
     (verb, name)
     for verb in ("check", "reset")
     for name in ("SDO answer short", "interface fails in set-up", "interface deaf in set-up", "node silent in set-up")
+]
+OUT_OF_REACH = [
+    pytest.param("dynamixel recalibrate", "rehearsal", "every write lost", marks=pytest.mark.slow),
+    ("feetech calibrate", "hold", "send value"),
+    ("feetech calibrate", "hold again", "send runtime"),
+    ("feetech calibrate", "rehearsal", "every write lost"),
+    pytest.param("feetech compensate", "track mop", "servo silent", marks=pytest.mark.slow),
 ]
 
 
@@ -90,3 +98,52 @@ def test_injections_are_drawn_evenly_over_the_verbs(faults):
     drawn = faults.drawn(every, 11, 3)
     assert sorted(case.verb for case in drawn) == ["calibrate"] * 5 + ["check"] + ["together"] * 5
     assert drawn == faults.drawn(every, 11, 3) != faults.drawn(every, 11, 4)
+
+
+@pytest.mark.parametrize(("verb", "phase", "name"), OUT_OF_REACH)
+def test_a_servo_that_no_word_reaches_is_judged_by_where_it_is(faults, bench, verb, phase, name):
+    """They held their place within 0.03 deg, while an edge of the encoder made their own estimate of speed 0.4 rad/s."""
+    verdict = bench.struck(faults.Case(verb, phase, name, 81000))
+    assert verdict.failures == []
+    assert verdict.noticed and verdict.rest_s < 0.5
+
+
+@pytest.fixture
+def judged(faults):
+    """A joint, and a judge that looks at it every 2.5 ms where it is told to be."""
+    at_rad = [0.0]
+    axle = faults.Axle("3", lambda: True, lambda: at_rad[0], lambda: 1.0, (-1.0, 1.0), 4.5)
+    watched, now_ns = faults.Watched(), [0]
+    watched.now, watched.axles = lambda: now_ns[0], [axle]
+
+    def look(*places_rad: float) -> float:
+        """When it moved last, in seconds."""
+        for place_rad in places_rad:
+            now_ns[0], at_rad[0] = now_ns[0] + 2_500_000, place_rad
+            watched._advanced()
+        return watched.moved_ns * 1e-9
+
+    return look
+
+
+def test_who_goes_nowhere_is_at_rest_whatever_its_speed(judged):
+    assert judged(*[0.1, 0.1003] * 40) <= 0.025
+
+
+def test_who_creeps_is_not_at_rest(judged):
+    assert judged(*np.arange(80) * 0.0025 * 0.03) == pytest.approx(0.2)
+
+
+def test_who_swings_is_not_at_rest(judged):
+    """At the same place whenever twenty milliseconds have passed."""
+    assert judged(*0.001 * np.sin(np.arange(80) * 2 * np.pi / 8)) == pytest.approx(0.2)
+
+
+def test_only_a_servo_without_a_watchdog_that_is_named_may_hold_its_goal_under_power(faults):
+    verdict = faults.Verdict("feetech calibrate", "hold", "servo silent", 0, said="joint 3 may still have power: ...")
+    axle = faults.Axle("3", lambda: True, lambda: 0.0, lambda: 0.0, (-1.0, 1.0), 4.5, watchdog=False)
+    assert faults._holds(axle, verdict)
+    assert not faults._holds(replace(axle, name="4"), verdict)
+    assert not faults._holds(replace(axle, watchdog=True), verdict)
+    assert not faults._holds(axle, replace(verdict, said="look at the wiring"))
+    assert not faults._holds(axle, replace(verdict, name="writes lost 100"))
