@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from dataclasses import replace
@@ -209,4 +210,23 @@ def test_lost_writes_do_not_keep_a_joint_under_power(count: int) -> None:
     run = Running("STS3215", {"kind": "drop", "frames": "write", "at_s": 0.1, "count": count})
     run.cycles(25)
     run.driver.stop_cycling()
+    assert run.driver.may_be_powered == () and not run.servo(FIRST).on and not run.servo(SECOND).on
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"kind": "mute", "joint": FIRST, "at_s": 0.1, "for_s": 1.8},
+        {"kind": "send_error", "error": "os", "at_s": 0.1, "count": 30},
+    ],
+)
+def test_a_servo_that_is_back_within_half_a_second_loses_its_power(fault: dict[str, Any]) -> None:
+    """It did not answer, or the port refused, when it was to let go; it was told once and kept its power."""
+    run = Running("STS3215", fault)
+    run.cycles(19)
+    with contextlib.suppress(HardwareError):
+        run.cycles(4)
+    run.driver.quick_stop()
+    with contextlib.suppress(HardwareError):
+        run.driver.stop_cycling()
     assert run.driver.may_be_powered == () and not run.servo(FIRST).on and not run.servo(SECOND).on

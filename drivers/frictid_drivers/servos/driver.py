@@ -47,7 +47,7 @@ _SETTLE_S = 1.5
 _BUSIEST = 0.45  # share of a cycle that the line may take: the reading begins in its middle
 _WATCHDOG_STEP_S = 0.02
 _INSIST_S, _AGAIN_S = 0.5, 0.01
-"""A servo that answers and is not off is told so for this long, at such intervals."""
+"""A servo that is not seen to be off is told so for this long, at such intervals, silent or not."""
 
 
 class ServoDriver:
@@ -395,17 +395,16 @@ class ServoDriver:
         Who is not seen to be off keeps its bus watchdog.
         """
         line = self._open_line()
-        with contextlib.suppress(FrictidError):
-            line.tell(self._registers.torque, {mine.id: b"\0" for mine in self._joints})
-        seen = [self._seen_off(servo) for servo in self._servos]
-        until_ns = self.clock.now_ns() + round(_INSIST_S * 1e9)
-        while False in seen and self.clock.now_ns() < until_ns:
+        waiting, until_ns = list(self._servos), self.clock.now_ns() + round(_INSIST_S * 1e9)
+        while True:
+            with contextlib.suppress(FrictidError):
+                line.tell(self._registers.torque, {servo.mine.id: b"\0" for servo in waiting})
+            waiting = [servo for servo in waiting if not self._seen_off(servo)]
+            if not waiting or self.clock.now_ns() >= until_ns:
+                break
             self.clock.wait_until(self.clock.now_ns() + round(_AGAIN_S * 1e9))
-            seen = [
-                self._seen_off(servo) if was is False else was for servo, was in zip(self._servos, seen, strict=True)
-            ]
-        off = [servo for servo, is_off in zip(self._servos, seen, strict=True) if is_off]
-        self.may_be_powered = tuple(servo.joint.name for servo in self._servos if servo.energised and servo not in off)
+        off = [servo for servo in self._servos if servo not in waiting]
+        self.may_be_powered = tuple(servo.joint.name for servo in waiting if servo.energised)
         with contextlib.suppress(FrictidError):
             self._arm_watchdog(0.0, off)
             for servo in off:
@@ -415,8 +414,8 @@ class ServoDriver:
                     servo.operating.follow_goals()
         line.heard = None
 
-    def _seen_off(self, servo: Servo) -> bool | None:
-        """Told to let go, and read back; None where it does not answer."""
+    def _seen_off(self, servo: Servo) -> bool:
+        """Told to let go, and read back."""
         with contextlib.suppress(FrictidError):
             return self._open_line().put(servo.mine.id, self._registers.torque, b"\0")
-        return None
+        return False
