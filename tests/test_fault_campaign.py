@@ -102,7 +102,7 @@ def test_injections_are_drawn_evenly_over_the_verbs(faults):
 
 @pytest.mark.parametrize(("verb", "phase", "name"), OUT_OF_REACH)
 def test_a_servo_that_no_word_reaches_is_judged_by_where_it_is(faults, bench, verb, phase, name):
-    """They held their place within 0.03 deg, while an edge of the encoder made their own estimate of speed 0.4 rad/s."""
+    """They held their place within 0.03 deg; an edge of the encoder made their own estimate of speed 0.4 rad/s."""
     verdict = bench.struck(faults.Case(verb, phase, name, 81000))
     assert verdict.failures == []
     assert verdict.noticed and verdict.rest_s < 0.5

@@ -12,6 +12,9 @@ from pathlib import Path
 from frictid_drivers.cia402 import cycle
 from frictid_drivers.cia402 import driver as cia402
 from frictid_drivers.cia402.settings import read_settings
+from frictid_drivers.servos import driver as servos
+from frictid_drivers.servos import line
+from frictid_drivers.servos.settings import read_settings as read_servo_settings
 from frictid_hil.errors import FrictidError, GateFailed, HardwareError, Interrupted, SafetyAbort
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol import wishes
@@ -22,6 +25,7 @@ from frictid_hil.runner.supervisor import JointLimits
 
 _MS = 1e-6
 _DRIVE = read_settings(RobotSetup("any", "virtual:any", 1000.0, ()))[0]
+_LINE = read_servo_settings(RobotSetup("any", "serial:any", 1000.0, ()))[0]
 _LIMITS = JointLimits(-1.0, 1.0, 1.0, 1.0)
 _ALONG = "ever slower along the planned path, then power off"
 _QUICK = "quick stop to every joint, standstill awaited, power off"
@@ -92,6 +96,29 @@ def _paths() -> list[StopPath]:
     ]
 
 
+def _servos() -> list[str]:
+    """What becomes of servos on a serial line."""
+    off_s, question_s = servos._SETTLE_S + servos._INSIST_S, line._TRIES * _LINE.answer_s
+    return [
+        "## Servos on a serial line",
+        "",
+        f"A servo holds its goal until all stand, {servos._SETTLE_S:g} s at most. It is then told to let go, again",
+        f"and again for {servos._INSIST_S:g} s, until it says that it has. So power is off within {off_s:g} s of the "
+        "stop, and for each",
+        f"servo that is silent within {1e3 * question_s:g} ms more. Where no word reaches a servo:",
+        "",
+        f"- **Dynamixel** lets go by its bus watchdog, {1e3 * _LINE.watchdog_s:g} ms after it last heard anything on",
+        "  the line, a question to another servo included.",
+        "- **Feetech** has no watchdog. It goes on to its last goal and holds it **with power** until its supply is",
+        "  switched off; the last words of the run name it and say so.",
+        "",
+        "How far that goal is ahead of the joint is bounded: by the bound of the following error, what the joint",
+        "travels until silence is noticed, and the distance that stands for a torque in `compensate`. The servo covers",
+        "it at its own speed. On an SO-101 these are 0.5 rad and 2 rad/s times 25 ms, so 0.55 rad, or 0.12 s at the",
+        "4.7 rad/s that an STS3215 makes without load. Where a lower speed is set in the servo, it takes longer.",
+    ]
+
+
 def page() -> str:
     """The page as Markdown."""
     insist_ms = cycle._INSIST_NS * _MS
@@ -124,6 +151,8 @@ def page() -> str:
             "",
             "MIT-mode actuators and bus servos have no quick stop of their own: they are told to brake. One that still",
             f"moves {wishes.STOP_NS * 1e-9:g} s later, because another sender commands it, loses its power, too.",
+            "",
+            *_servos(),
             "",
             "This page is generated from the code by `python -m frictid_drivers.stop_paths docs/reference/stops.md`.",
             "",

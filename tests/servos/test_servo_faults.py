@@ -230,3 +230,20 @@ def test_a_servo_that_is_back_within_half_a_second_loses_its_power(fault: dict[s
     with contextlib.suppress(HardwareError):
         run.driver.stop_cycling()
     assert run.driver.may_be_powered == () and not run.servo(FIRST).on and not run.servo(SECOND).on
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_servo_that_no_word_reaches_comes_to_rest_at_its_last_goal(model: str) -> None:
+    """From 2 rad/s, by its own loop, well within half a second."""
+    run = Running(model, {"kind": "send_error", "error": "os", "at_s": 0.5})
+    with contextlib.suppress(HardwareError):
+        run.cycles(200, step_rad=0.01)
+    run.driver.quick_stop()
+    servo, clock, goal_rad = run.servo(FIRST), run.driver.clock, run.at_rad - 0.01
+    assert abs(servo.plant.true_velocity_rad_s) > 1.5 and abs(goal_rad - servo.plant.position_rad) < 0.2
+    places = []
+    for _ in range(30):
+        clock.wait_until(clock.now_ns() + 5_000_000)
+        places.append(servo.plant.position_rad)
+    assert servo.on and servo.plant.position_rad == pytest.approx(goal_rad, abs=0.03)
+    assert max(places) < goal_rad + 0.03 and abs(places[-1] - places[-5]) < 4e-4
