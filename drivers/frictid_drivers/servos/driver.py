@@ -171,7 +171,7 @@ class ServoDriver:
         for joint, mine in zip(self.setup.joints, self._joints, strict=True):
             findings += joint_findings(joint, mine, self._told[joint.name], plan)
         if not self._registers.watchdog:
-            alone = "these servos have no watchdog: if this program dies they hold their last goal under power"
+            alone = "no watchdog: if this program dies these servos go to their last goal and hold it under power"
             findings.append(Finding(Severity.WARNING, "bus", alone, "keep the switch of their supply at hand"))
         return findings
 
