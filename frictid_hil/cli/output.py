@@ -78,7 +78,8 @@ class Output:
 
     def options(self, kind: Callable[..., Asked], **more: Any) -> Asked:
         """The value that a job takes: what was given under the names of its fields, and ``more``; else its defaults."""
-        asked = {name: self.given[name] for name in (one.name for one in fields(kind)) if name in self.given} | more  # type: ignore[arg-type]  # a dataclass
+        names = {one.name for one in fields(kind)}  # type: ignore[arg-type]  # a dataclass
+        asked = {name: value for name, value in self.given.items() if name in names} | more
         return kind(**{n: tuple(v) if isinstance(v, list) else v for n, v in asked.items() if v is not None})
 
     @property

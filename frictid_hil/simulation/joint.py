@@ -93,13 +93,20 @@ class Simulated(Protocol):
     """What a robot file tells of a joint that is simulated."""
 
     @property
-    def simulated(self) -> Mapping[str, Any]: ...  # noqa: D102 - the mapping, as read from YAML
+    def simulated(self) -> Mapping[str, Any]:
+        """The mapping, as read from YAML."""
+
     @property
-    def gear_ratio(self) -> float: ...  # noqa: D102 - motor revolutions per joint revolution
+    def gear_ratio(self) -> float:
+        """Motor revolutions per joint revolution."""
+
     @property
-    def rated_torque_nm(self) -> float: ...  # noqa: D102 - joint side
+    def rated_torque_nm(self) -> float:
+        """Joint side."""
+
     @property
-    def max_torque_nm(self) -> float: ...  # noqa: D102 - limit of the joint
+    def max_torque_nm(self) -> float:
+        """Limit of the joint."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -90,8 +90,11 @@ def replayed(
 class Stepper(Protocol):
     """A model that some engine moves, step by step."""
 
-    def step(self, control: Array) -> Array: ...  # noqa: D102 - under a control, (nu,); the force of every actuator
-    def position(self) -> Array: ...  # noqa: D102 - coordinates of the model, (nq,)
+    def step(self, control: Array) -> Array:
+        """Under a control, (nu,); the force of every actuator."""
+
+    def position(self) -> Array:
+        """Coordinates of the model, (nq,)."""
 
 
 class _InMujoco:

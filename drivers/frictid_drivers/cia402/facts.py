@@ -63,8 +63,11 @@ class Facts:
 class Source(Protocol):
     """What can be asked for objects: a drive, or an EDS file."""
 
-    def find(self, item: od.Object) -> int | None: ...  # noqa: D102 - a value, None where there is none
-    def find_text(self, index: int) -> str: ...  # noqa: D102 - a text, "" where there is none
+    def find(self, item: od.Object) -> int | None:
+        """A value, None where there is none."""
+
+    def find_text(self, index: int) -> str:
+        """A text, "" where there is none."""
 
 
 def read_facts(drive: Source, quirks_of: Callable[[int, int, int], Quirks] | None = None) -> Facts:

@@ -82,10 +82,17 @@ class Wire(Protocol):
     heard: Callable[[int, bytes, int], None]
 
     @property
-    def members(self) -> int: ...  # noqa: D102 - how many are connected
-    def send(self, can_id: int, data: bytes) -> None: ...  # noqa: D102 - to all members
-    def wait(self, longest_s: float) -> None: ...  # noqa: D102 - for something to serve
-    def serve(self) -> None: ...  # noqa: D102 - all that has arrived
+    def members(self) -> int:
+        """How many are connected."""
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """To all members."""
+
+    def wait(self, longest_s: float) -> None:
+        """For something to serve."""
+
+    def serve(self) -> None:
+        """All that has arrived."""
 
 
 class RackProcess:
