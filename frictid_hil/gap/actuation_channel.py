@@ -33,8 +33,6 @@ SLOWEST = 10
 """Control ticks to a row of the log up to which what the controller did between two rows can be told from them."""
 WITHIN_ROWS = 0.3
 """One-sigma of when a command took effect and a velocity was taken, in rows of a log slower than its controller."""
-
-
 NEAREST = (1.0 / math.sqrt(2.0), math.sqrt(2.0))
 """Coefficients of a time: values to try at most double, so that the nearest one is no further from the true one."""
 

@@ -29,8 +29,6 @@ from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import Payload
 
 MAX_ROWS = 2_000_000  # rows of one log that are read; a longer one is refused with advice, not quietly cut
-
-
 REST_SHARE = 1e-4  # a log whose travel is below this share of the longest one shows a joint at rest
 LONG_GAP_S = 0.25  # a gap from which a recording goes on as another log: nobody knows what the joint did meanwhile
 LEAST_PIECE_ROWS = 200  # shorter pieces between gaps are left out

@@ -80,16 +80,15 @@ class Envelope:
         speed = min(2.0, 0.9 * max_velocity_rad_s) if velocity_rad_s is None else velocity_rad_s
         if not 0.0 < speed <= max_velocity_rad_s:
             raise UsageError(f"a peak speed of {speed:.3g} rad/s is beyond the joint's {max_velocity_rad_s:.3g} rad/s")
-        aside = [
-            c for c in (centre + 1.2, centre - 1.2) if position_min_rad < c - travel and c + travel < position_max_rad
-        ]
+        low, high = position_min_rad, position_max_rad
+        aside = (c for c in (centre + 1.2, centre - 1.2) if low < c - travel and c + travel < high)
         return Envelope(
             centre_rad=centre,
             travel_rad=travel,
             velocity_rad_s=speed,
             triangle_rad=min(0.5, 0.9 * travel),
             chirp_velocity_rad_s=min(0.35, 0.25 * speed + 0.1),
-            second_centre_rad=aside[0] if aside else None,
+            second_centre_rad=next(aside, None),
         )
 
 

@@ -69,9 +69,10 @@ def plant_channel(
         held = first_slide(v.position_rad, 3.0 * v.coulomb_nm / v.stiffness_nm_per_rad)
         first = min(held // low_pass.stride + 1, len(range(0, residual.size, low_pass.stride)) // 3)
         rows.append(rows_of(r, columns, residual, low_pass, first=first, known_noise=noise, report=report))
-    step_s = logs[0].step_s * low_pass.stride
-    rows = _told(without_nuisances(rows, known, candidates), white_nm(logs, low_pass), views[0].coulomb_nm, step_s)
-    raw, known_floor = _raw(logs, residuals, noises), _known_floor(logs, rows, low_pass)
+    step_s, white = logs[0].step_s * low_pass.stride, white_nm(logs, low_pass)
+    rows = _told(without_nuisances(rows, known, candidates), white, views[0].coulomb_nm, step_s)
+    raw = _raw(logs, residuals, noises)
+    known_floor = math.hypot(white, rms(np.concatenate([log.known_noise[log.told] for log in rows])))
     return Channel(
         "plant", step_s, tuple(rows), tuple(known), tuple(candidates), scale, low_pass.cutoff_hz, raw, known_floor
     )
@@ -130,11 +131,6 @@ def _raw(logs: Sequence[Recording], residuals: Sequence[Array], noises: Sequence
     own = [differenced_rms(t) for k in chosen if (t := logs[k].experiment.rigid_body_torque_nm) is not None]
     noise = math.hypot(rms(np.concatenate([noises[k] for k in chosen])), rms(np.array(white)))
     return gap, math.hypot(noise, rms(np.array(own))) if own else noise
-
-
-def _known_floor(logs: Sequence[Recording], rows: Sequence[Rows], low_pass: LowPass) -> float:
-    """RMS that white noise of the torque and noise of the position leave behind the low-pass, N m."""
-    return math.hypot(white_nm(logs, low_pass), rms(np.concatenate([log.known_noise[log.told] for log in rows])))
 
 
 def white_nm(logs: Sequence[Recording], low_pass: LowPass) -> float:

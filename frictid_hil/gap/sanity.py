@@ -185,20 +185,15 @@ def _torque_sign(e: Experiment) -> float | None:
     if e.torque_nm is None:
         return None
     moved = np.diff(e.position_rad)
-    path = float(np.sum(np.abs(moved)))
-    if path <= 0.0:
-        return None
     centred = 0.5 * (e.torque_nm[1:] + e.torque_nm[:-1])
     forth, back = moved > 0.0, moved < 0.0
     if not forth.any() or not back.any():
         return None
     # Compared at equal places, gravity cancels; a fit of torque on direction and position does that.
-    direction = np.sign(moved)
     q = e.position_rad[:-1]
     acceleration = np.gradient(np.gradient(LowPass.at(1.0 / e.step_s)(q)))
-    columns = np.stack(
-        [direction, np.cos(q), np.sin(q), acceleration / max(float(np.std(acceleration)), 1e-12)], axis=1
-    )
+    effort = acceleration / max(float(np.std(acceleration)), 1e-12)
+    columns = np.stack([np.sign(moved), np.cos(q), np.sin(q), effort], axis=1)
     weights = np.linalg.lstsq(columns, centred, rcond=None)[0]
     return float(weights[0]) / max(float(np.std(centred)), 1e-12)
 
@@ -282,10 +277,6 @@ def one_sided(experiments: ExperimentSet) -> str | None:
         return "the joint moves in one direction only: friction, bias and gravity cannot be told apart"
     every = np.concatenate(speeds)
     moving = every[every > 0.05 * float(np.quantile(every, 0.99))]
-    if (
-        moving.size
-        and float(np.quantile(moving, 0.9) / max(np.quantile(moving, 0.1), 1e-12)) < 1.15
-        and not math.isnan(total)
-    ):
+    if moving.size and float(np.quantile(moving, 0.9) / max(np.quantile(moving, 0.1), 1e-12)) < 1.15:
         return "the joint moves at one speed only: what depends on speed cannot be told from what does not"
     return None

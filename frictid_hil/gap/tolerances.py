@@ -8,7 +8,7 @@ leaves out is taken as ``unstated``.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 from frictid_hil.config.nominal import ABSOLUTE_ONLY, Tolerance
@@ -82,12 +82,10 @@ class Tolerances:
         """What a file states; defaults by kind of number for the rest."""
         return Tolerances(**{field.name: _sigma(field.name, told) for field in fields(Tolerances)})
 
-    def __iter__(self) -> Iterator[tuple[str, Sigma]]:
-        return ((field.name, getattr(self, field.name)) for field in fields(self))
-
     def lines(self) -> tuple[str, ...]:
         """One line for each number, for a person: ``inertia_kg_m2: 5 % (unstated)``."""
-        return tuple(f"{name}: {_spelt(sigma)} ({sigma.source.replace('_', ' ')})" for name, sigma in self)
+        told: Mapping[str, Sigma] = {field.name: getattr(self, field.name) for field in fields(self)}
+        return tuple(f"{name}: {_spelt(sigma)} ({sigma.source.replace('_', ' ')})" for name, sigma in told.items())
 
 
 def stated_by(profile: JointProfile) -> dict[str, object]:

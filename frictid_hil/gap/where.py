@@ -76,11 +76,12 @@ def where(
     logs = []
     for recording in every:
         low_pass = LowPass.at(1.0 / recording.step_s)
-        floor = noise_nm**2 * (recording.step_s * low_pass.stride)
+        row_s = recording.step_s * low_pass.stride
+        floor = noise_nm**2 * row_s
         for region, residual in _of_drive(recording, low_pass, velocity_gain_nm_s_per_rad):
-            add(region, _energy(residual, low_pass, recording, floor))
+            add(region, float(np.sum(low_pass.thinned(residual[:, None])[:, 0] ** 2 * row_s - floor)))
         log, winding, still = _thinned(recording, low_pass, top)
-        squares = log.residual_nm**2 * (recording.step_s * log.stride)
+        squares = log.residual_nm**2 * row_s
         add(Region.REVERSAL, float(np.sum(squares[winding] - floor)))
         add(Region.STANDSTILL, float(np.sum(squares[still] - floor)))
         logs.append(log)
@@ -127,11 +128,6 @@ def _of_drive(recording: Recording, low_pass: LowPass, velocity_gain: float | No
             inertia = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2
             parts.append((Region.KINEMATICS, inertia * np.gradient(low_pass(error), recording.step_s)))
     return parts
-
-
-def _energy(residual_nm: Array, low_pass: LowPass, recording: Recording, floor: float) -> float:
-    thin = low_pass.thinned(residual_nm[:, None])[:, 0]
-    return float(np.sum(thin**2 * (recording.step_s * low_pass.stride) - floor))
 
 
 def _thinned(recording: Recording, low_pass: LowPass, top: float) -> tuple[_Log, np.ndarray, np.ndarray]:
