@@ -20,7 +20,6 @@ from frictid_hil.friction.identify import IdentifiedPairs
 from frictid_hil.friction.link import Link, soft_link
 from frictid_hil.friction.recording import CycleRecording, Motion, synchronised
 from frictid_hil.friction.skew import Delay, TimeSkew, measured_skew, seen_delay
-from frictid_hil.friction.trajectory import Array
 
 _GAP_STEPS = 3.0  # between two samples, in sample periods: a longer one has jerked the joint
 SHAKES_S = 0.02  # how long a position loop may take to catch up with its path: that of one with a bandwidth of 20 Hz
@@ -50,7 +49,7 @@ class Cleaned:
 
 
 def cleaned(recording: CycleRecording, notes: list[str]) -> Cleaned:
-    """Ready for an estimator, what a person should know in the notes; ``IdentificationError`` for an empty window."""
+    """The recording ready for an estimator, with notes for a person; ``IdentificationError`` for an empty window."""
     recording, shakes = without_shakes(recording)
     if shakes:
         notes.append(f"{shakes} missed set-points shook the joint; its torque was taken from beside them")
@@ -123,7 +122,9 @@ def without_shakes(recording: CycleRecording) -> tuple[CycleRecording, int]:
     time_s, torque = recording.time_s, recording.torque_nm.copy()
     steps_s = np.diff(time_s)
     gaps_s = time_s[:-1][steps_s > 1.5 * float(np.median(steps_s))]
-    noise = _noise(torque)
+    # One-sigma of the torque's noise, from how far samples lie beside the mean of their neighbours.
+    off = np.abs(torque[1:-1] - 0.5 * (torque[:-2] + torque[2:]))
+    noise = float(1.4826 * np.median(off) / np.sqrt(1.5))
     shaken = 0
     for missed_s in np.union1d(gaps_s, recording.stops_s):
         first = int(np.searchsorted(time_s, missed_s, side="right"))
@@ -141,9 +142,3 @@ def without_shakes(recording: CycleRecording) -> tuple[CycleRecording, int]:
             torque[first:last] = line
             shaken += 1
     return (replace(recording, torque_nm=torque), shaken) if shaken else (recording, 0)
-
-
-def _noise(torque: Array) -> float:
-    """One-sigma of the torque's noise, from how far samples lie beside the mean of their neighbours."""
-    beside = torque[1:-1] - 0.5 * (torque[:-2] + torque[2:])
-    return float(1.4826 * np.median(np.abs(beside)) / np.sqrt(1.5))

@@ -29,10 +29,7 @@ FORMS = ("mo", "mol", "mop")
 PAPER_RATIO = 0.9
 PAPER_STIFFNESS_NM_PER_RAD = 10_000.0
 OUR_RATIO = 0.95
-COARSE_RATIO = 0.5
-"""Where an encoder is too coarse to show presliding. It shows a turn only once the joint slides: a stuck joint is given
-the compensation of the old direction until then, that of the new one from then on, and starts with a jump of speed that
-grows with R. At 0.95 the jump is as large as the speed of the tracking test."""
+COARSE_RATIO = 0.5  # where an encoder too coarse for presliding shows a turn late: the joint starts with a jump, by R
 
 RATIO_MARGIN = 0.02
 STIFFNESS_MARGIN = 0.1  # the setting ``ours`` is to stand with R larger by the one and K larger by this share

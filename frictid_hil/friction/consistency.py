@@ -19,42 +19,40 @@ import numpy as np
 from frictid_hil.friction.estimate import Estimate
 from frictid_hil.friction.gate import Gate
 from frictid_hil.friction.recording import CycleRecording, Motion
-from frictid_hil.friction.repetition import changed_between, friction_at
 from frictid_hil.friction.trajectory import Array
 
 MOST_SEEN_S = 0.0015  # what the data may ask for beyond the declared delay of the torque, where they are sure of it ...
 MOST_SEEN_WITH_LINK_S = 0.003
 SURE = 2.5  # ... by so many standard deviations, its own and the declared one's ...
-MOST_UNSURE_S = 0.006
-"""... but for joints that move together, which have no gate of inertia, no more than this and a step of the clock."""
-MOST_TURNOVER_S = 0.012
-"""Friction that turns over later, or sooner, after a fast turning point than after the same slow travel ..."""
-MOST_TURNOVER_SEEN_S = 0.004
-"""... and where the delay that the data ask for has the same sign and is more than ``MOST_SEEN_S``."""
+MOST_UNSURE_S = 0.006  # ... but for joints that move together, without a gate of inertia, no more than this and a step
+MOST_TURNOVER_S = 0.012  # friction that turns over later, or sooner, after a fast turn than after such slow travel ...
+MOST_TURNOVER_SEEN_S = 0.004  # ... and where the delay asked for has the same sign and is more than ``MOST_SEEN_S``
 MOST_SEEN_DRAGGED_S, SURE_BESIDE = 0.00075, 1.0
 """The same where a link was found, which drags that delay down, if it is more than so many standard
 deviations: soft joints that are not late ask for 0.06 ms."""
 MOST_COARSE_TURNOVER_S, MOST_TURNOVER_STEP_S, FEW_CYCLES = 0.03, 0.0105, 3
 """Samples further apart, with the coarse steps of servos, tell no less than this, and below 100 Hz nothing."""
-MOST_APART_S = 0.008
-"""Reported velocity against differenced position: a filter that nobody declared does no harm to the curve ..."""
+MOST_APART_S = 0.008  # reported velocity against differenced position: a filter that nobody declared does no harm ...
 MOST_UNSTEADY_S = 0.004  # ... but a delay that comes and goes does.
 MOST_SCALE = 0.05
 MOST_INERTIA = 2.0  # inertia against what the robot file expects, either way
 FLAT_SHARE = 0.003
-FLAT_SPIKE = 6.0
-"""Samples at the very extreme, against the mean of the three steps below it; a sine has 3, noise less than 1."""
+FLAT_SPIKE = 6.0  # samples at the very extreme over the mean of the three steps below; a sine has 3, noise less than 1
 
 CONTINUED = 2.0
 """The bound of ``GateLimits.other_stretches`` grows by this where a stretch was slower than the slowest pair, where the
 curve is only continued, and no cycle tells its friction at that speed ..."""
 SLOWEST_SHARE = 0.5  # ... down to this share of that pair's speed.
-_BESIDE = 1.0 / 12.0
-"""Share of a cycle to either side of its turning point: half of the peak speed there, inertia and gravity as at it."""
+_BESIDE = 1.0 / 12.0  # share of a cycle beside its turning point: half its peak speed, inertia and gravity as at it
 _AROUND = 0.2  # share of a cycle to either side of its middle in which the joint turns
 _STEPS = 1000.0
 _LATE = "torque or position are late: a filter that was not declared (`options: timing`), or reports of old figures"
 _LEAST_SAMPLES, _LEAST_AT_SPEED = 50, 12
+_PARTS = 8  # of a repeated cycle; the first one is left out, as one of the two runs may begin from rest
+_LEAST = 4  # samples of a part
+_ALIKE = 4.0  # samples that err together, after smoothing
+_BAND = 0.15  # speeds that count as one, as a share
+_CLEAR = 0.2  # share of its peak at which a cycle is clear of its turning points, where friction is still a spring
 
 
 def consistency(recording: CycleRecording, motion: Motion, result: Estimate, most_changed: float) -> list[Gate]:
@@ -168,33 +166,45 @@ def _flat(recording: CycleRecording) -> Gate:
     """A torque that is cut off piles up at its extreme."""
     torque = np.asarray(recording.torque_nm, dtype=np.float64)
     step = max(recording.torque_quantum_nm, float(np.abs(torque).max()) / _STEPS) or 1.0
-    share = worst = 0.0
+    share = 0.0
     for signed in (torque, -torque):
         below = np.floor((signed.max() - signed) / step + 0.5)
         counts = np.array([float(np.sum(below == n)) for n in range(4)])
         spike = counts[0] / max(1.0, float(counts[1:].mean()))
         if spike > FLAT_SPIKE and counts[0] / torque.size > FLAT_SHARE:
-            share, worst = max(share, counts[0] / torque.size), max(worst, spike)
+            share = max(share, counts[0] / torque.size)
     said = f"{100 * share:.2f} % of the samples pile up at the extreme of the torque (allowed {100 * FLAT_SHARE:.1f} %)"
     cause = "the reported torque is cut off: by a limit of the drive, or by its report"
     return Gate.at_most("flat_tops", share, FLAT_SHARE, said, cause)
 
 
 def _repetition(recording: CycleRecording, motion: Motion, result: Estimate, most: float) -> Gate | None:
-    """The torque of the repeated cycle against that of its first run, at the same places."""
-    changed = changed_between(recording, motion)
-    if changed is None or recording.repeat is None:
+    """The torque of the repeated cycle against that of its first run, part by part; a half run tells nothing."""
+    repeat, time = recording.repeat, motion.time_s
+    if repeat is None:
         return None
-    peak_rad_s = recording.procedure.peak_velocities_rad_s[[recording.repeat.cycle - 1]]
+    first_s, last_s = recording.procedure.cycle_starts_s[repeat.cycle - 1 : repeat.cycle + 1]
+    length_s = float(last_s - first_s)
+    if time[-1] < repeat.start_s + length_s - 2.0 * motion.smoother.step_s:
+        return None
+    since_s = np.arange(length_s / _PARTS, length_s, motion.smoother.step_s)
+    once, again = (np.interp(since_s + begin, time, motion.torque_nm) for begin in (first_s, repeat.start_s))
+    parts = np.array_split(again - once, _PARTS - 1)
+    if min(part.size for part in parts) < _LEAST:
+        return None
+    # A part in which something changed would excuse itself by its own spread.
+    spread_nm = float(np.median([part.std() for part in parts]))
+    chance_nm = spread_nm / max(1.0, parts[-1].size / _ALIKE) ** 0.5
+    peak_rad_s = recording.procedure.peak_velocities_rad_s[[repeat.cycle - 1]]
     level_nm = float(result.curve.magnitude(peak_rad_s)[0])
-    shares, allowed = np.abs(changed[0]) / level_nm, most + SURE * changed[1] / level_nm
+    shares, allowed = np.abs([part.mean() for part in parts]) / level_nm, most + SURE * chance_nm / level_nm
     worst = int(np.argmax(shares))
     share = float(shares[worst])
     return Gate.at_most(
         "repetition",
         share,
         allowed,
-        f"cycle {recording.repeat.cycle} again: in part {worst + 2} of {shares.size + 1} its torque differs by "
+        f"cycle {repeat.cycle} again: in part {worst + 2} of {shares.size + 1} its torque differs by "
         f"{100 * share:.1f} % of the friction (allowed {100 * allowed:.3g} %)",
         "the torque's scale or offset changed during the run, something touched the joint, or wrong reports",
     )
@@ -300,3 +310,29 @@ def _falls_to_zero(time: Array, column: Array, begin_s: float, lasts_s: float) -
         return None
     pair = slice(below[0] - 1, below[0] + 1)
     return float(np.interp(0.0, -column[pair], time[pair]))
+
+
+def friction_at(recording: CycleRecording, motion: Motion, speed_rad_s: float, least_samples: int) -> Array:
+    """Half of forward minus backward torque of every cycle, the repeated one too, as it passes through a speed, N m.
+
+    A cycle passes it as often faster and faster as slower and slower, and at the same places both ways: neither inertia
+    nor gravity is in it. Cycles that pass it too close to a turning point, or have too few samples of it, are left out.
+    """
+    peaks = recording.procedure.peak_velocities_rad_s
+    spans = list(pairwise(recording.procedure.cycle_starts_s.tolist()))
+    repeat = recording.repeat
+    if repeat is not None:
+        begin_s, end_s = spans[repeat.cycle - 1]
+        spans.append((repeat.start_s, repeat.start_s + end_s - begin_s))
+        peaks = np.append(peaks, peaks[repeat.cycle - 1])
+    time, velocity, found = motion.time_s, motion.velocity_rad_s, []
+    near = np.abs(np.abs(velocity) - speed_rad_s) < _BAND * speed_rad_s
+    for (begin_s, end_s), peak in zip(spans, peaks, strict=True):
+        if speed_rad_s < _CLEAR * peak:
+            continue
+        here = near & (time >= begin_s) & (time < end_s)
+        ways = [here & (velocity > 0.0), here & (velocity < 0.0)]
+        if min(int(way.sum()) for way in ways) >= least_samples:
+            there, back = (float(np.mean(motion.torque_nm[way])) for way in ways)
+            found.append((there - back) / 2)
+    return np.array(found)

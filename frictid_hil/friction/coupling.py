@@ -29,8 +29,7 @@ _WIDTH_S = 0.008  # of the kernel that both sides go through: half power at 17 H
 _GUARD_RAD = 0.005
 _SLOWEST = 0.1  # samples below this share of the highest speed are left out: friction is still a spring there
 _KNOTS = np.array([0.0, 0.15, 0.35, 0.6, 1.0])
-_POSTURE = 0.05
-"""Share of M_ij by which it may differ along the travel from what the stretch shows, one standard deviation."""
+_POSTURE = 0.05  # share of M_ij by which it may differ along the travel from what the stretch shows, one sigma
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,8 +34,7 @@ _GAP_STEPS = 5.0
 _LEAST_GRAVITY_TRAVEL_RAD = 0.5
 _LEAST_REAL = 0.4  # share of the acceleration that a wider kernel leaves; noise keeps next to nothing of it
 MOST_INTERVAL = 0.2  # of the friction: half a 95 % interval that a curve may have
-MOST_APART = 0.15
-"""Of the friction: how far the curves of both halves of the recording may lie apart, beyond their intervals."""
+MOST_APART = 0.15  # of the friction: how far the curves of both halves may lie apart, beyond their intervals
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +77,16 @@ def function_a(
         (velocity >= above, velocity <= below), velocity, torque, bounds, where
     )
     if not (n_plus.all() and n_minus.all()):
-        raise _empty_window(velocity, bounds, thresholds, n_plus, where)
+        n = int(np.argmin(np.minimum(n_plus, n_minus)))
+        way, direction = (1, "forward") if n_plus[n] == 0 else (-1, "backward")
+        reached = float((way * velocity[bounds[n] : bounds[n + 1]]).max())
+        raise IdentificationError(
+            f"cycle {n + 1} of {len(thresholds)} has no sample in its {direction} window: the speed reached "
+            f"{max(reached, 0.0):.4g} and the window begins at {thresholds[n]:.4g} rad/s",
+            where=where,
+            cause="poor tracking or torque saturation",
+            next_step="lower the peak velocity, raise the travel, or tune the position loop",
+        )
     return IdentifiedPairs(v_plus, (f_plus - f_minus) / 2, -v_minus, f_plus, f_minus, n_plus, n_minus)
 
 
@@ -121,21 +129,3 @@ def _means(
         some = np.maximum(count, 1)  # an empty window is the caller's to report
         means.append((v / some, f / some, count.astype(np.int64)))
     return means
-
-
-def _empty_window(
-    velocity: Array, bounds: NDArray[np.int64], thresholds: Array, n_plus: NDArray[np.int64], where: str
-) -> IdentificationError:
-    for n, (begin, end) in enumerate(pairwise(bounds)):
-        forward, backward = float(velocity[begin:end].max()), float(-velocity[begin:end].min())
-        ways = ("forward", forward, n_plus[n] == 0), ("backward", backward, backward < thresholds[n])
-        for direction, reached, empty in ways:
-            if empty:
-                return IdentificationError(
-                    f"cycle {n + 1} of {len(thresholds)} has no sample in its {direction} window: the speed reached "
-                    f"{max(reached, 0.0):.4g} and the window begins at {thresholds[n]:.4g} rad/s",
-                    where=where,
-                    cause="poor tracking or torque saturation",
-                    next_step="lower the peak velocity, raise the travel, or tune the position loop",
-                )
-    raise AssertionError("no window is empty")  # pragma: no cover - the caller saw an empty one

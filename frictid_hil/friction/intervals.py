@@ -31,8 +31,7 @@ from frictid_hil.friction.rigid_body import COVERAGE
 from frictid_hil.friction.trajectory import Array
 
 FINER = 8  # points per sample at which windows begin and end: one sample too many on one side is an error of its own
-STEADY = 0.28
-"""Width of the windows' kernel in radians of the fastest cycle: it keeps a ringing link from moving their ends."""
+STEADY = 0.28  # width of the windows' kernel, radians of the fastest cycle: a ringing link must not move their ends
 _ENOUGH = 6  # cycles from which on two parameters can be told from the scatter of so many differences
 
 
@@ -90,19 +89,15 @@ def window_terms(
     slope = aligned_pairs(recording, motion, rate).torque_nm
     scatter = _scatter(recording, motion, solved)
     starts_s = recording.procedure.cycle_starts_s
-    weights = None if others is None else _windowed(recording, motion, others.columns)
-    return Terms(
-        scatter=scatter,
-        skew=np.abs(slope) * recording.skew.uncertainty_s,
-        model=np.zeros_like(slope)
-        if solved is None or others is None or weights is None
-        else _apart(pairs, solved, scatter, others, weights),
-        drift=pairs.torque_nm * _drift_shares(recording, (starts_s[:-1] + starts_s[1:]) / 2, drift),
-        beside=np.zeros_like(slope) if others is None or weights is None else others.deviation(weights),
-        link=np.zeros_like(slope)
-        if link is None
-        else _spread(_windowed(recording, motion, link.columns), link.covariance),
-    )
+    model = beside = taken = np.zeros_like(slope)
+    if others is not None:
+        weights = _windowed(recording, motion, others.columns)
+        beside = others.deviation(weights)
+        model = model if solved is None else _apart(pairs, solved, scatter, others, weights)
+    if link is not None:
+        taken = _spread(_windowed(recording, motion, link.columns), link.covariance)
+    drifted = pairs.torque_nm * _drift_shares(recording, (starts_s[:-1] + starts_s[1:]) / 2, drift)
+    return Terms(scatter, np.abs(slope) * recording.skew.uncertainty_s, model, drifted, beside, taken)
 
 
 def _windowed(recording: CycleRecording, motion: Motion, columns: Array) -> Array:

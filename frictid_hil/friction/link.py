@@ -30,16 +30,12 @@ _LOG_DAMPING = (-5.8, -0.7)
 _GUESS = -3.2
 _STEP = 0.12  # of the search over the logarithm of the frequency
 _CHANCE = 20.0
-"""What the link takes of the residual's power, in shares of what one independent sample leaves. The best of some twenty
-frequencies takes x by chance with a probability of 20 exp(-x / 2), 0.1 % here: short programmes at a low rate leave few
-samples, of which chance takes 10 % of the rms. Measured: rigid joints at most 12, soft ones at least 28."""
+"""What the link takes of the residual's power, in shares of what one independent sample leaves; the best of some twenty
+frequencies does by chance with 20 exp(-x / 2), 0.1 %. Measured: rigid joints at most 12, soft ones at least 28."""
 _GAIN = 0.95
-"""The link must also leave less than this share of the residual's rms, where samples are many and what is no link shows
-as well: ripple and load on rigid joints leave at least 0.96. A soft joint whose link takes less than that is lighter
-than its noise, and its curve does not change."""
-_SURE = 3.0
-"""Standard deviations that the link's inertia must have: 5 % wrong in all, of some twenty frequencies looked at. On the
-soft joint that shows it least, whose spring hardens, 3.2."""
+"""Share of the residual's rms that the link leaves at most, where samples are many: ripple and load on rigid joints
+leave at least 0.96, and a link that takes less is lighter than its noise."""
+_SURE = 3.0  # standard deviations that the link's inertia must have; the soft joint that shows it least has 3.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -35,11 +35,8 @@ _SMOOTHING_S = 0.02
 _TURN_SHARE = 0.3  # A turning point is followed by at least this share of the whole travel in the other direction
 _LEAST_ROWS = 20
 _PLAINLY = 0.015
-"""A joint is called gradual where that shape leaves nowhere more than this share of D.
-
-Averaged over a tenth of D / sigma. A joint whose friction is partly of the other kind leaves 2 % and more, and would
-hunt with a spring that is twice as stiff after the turning point as at rest (docs/reference/compensation-law.md).
-"""
+"""Share of D that a gradual joint's shape leaves at most, averaged over a tenth of D / sigma. A joint that is partly of
+the other kind leaves 2 % and more, and would hunt with a gradual spring (docs/reference/compensation-law.md)."""
 _LOOKED_AT = 20  # tenths of D / sigma from the turning point on; friction has turned over long before
 _LEAST_IN_TENTH = 10
 _LEAST_CLARITY = 4.0  # the passage is larger than what the fitted shape leaves by at least this factor
@@ -55,12 +52,6 @@ class Presliding:
     stiffness_nm_per_rad: Measured
     level_nm: Measured
     gradual: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _Passage:
-    travel: Array  # since the turning point, positive
-    drop: Array  # torque, signed so that it falls
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +80,7 @@ def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: s
     bounds = [*turns, smooth.size - 1]
     torque = np.asarray(torque_nm, dtype=np.float64)
     every = [_passage(smooth, torque, start, stop) for start, stop in pairwise(bounds)]
-    passages = [passage for passage in every if passage.travel.size >= _LEAST_ROWS]
+    passages = [(travel, drop) for travel, drop in every if travel.size >= _LEAST_ROWS]
     at_once, gradually = (_fit_all(shape, passages) for shape in (_at_once, _gradually))
     shapes = [fitted for fitted in (at_once, gradually) if fitted is not None]
     if not shapes:
@@ -176,10 +167,11 @@ def _turning_points(position: Array) -> list[int]:
     return turns
 
 
-def _passage(position: Array, torque: Array, start: int, stop: int) -> _Passage:
+def _passage(position: Array, torque: Array, start: int, stop: int) -> tuple[Array, Array]:
+    """Travel since a turning point, positive, and torque, signed so that it falls."""
     direction = np.sign(position[stop] - position[start])
     travel = (position[start:stop] - position[start]) * direction
-    return _Passage(travel, -direction * torque[start:stop])
+    return travel, -direction * torque[start:stop]
 
 
 def _at_once(travel: Array, start: float, stiffness: float, change: float) -> Array:
@@ -190,11 +182,10 @@ def _gradually(travel: Array, start: float, stiffness: float, change: float) -> 
     return np.asarray(start - change * (1.0 - np.exp(-2.0 * stiffness * travel / change)))
 
 
-def _fit_all(shape: Callable[..., Array], passages: list[_Passage]) -> _Fitted | None:
+def _fit_all(shape: Callable[..., Array], passages: list[tuple[Array, Array]]) -> _Fitted | None:
     """None where fewer than two passages could be fitted."""
     found: list[tuple[float, float, float, float]] = []
-    for passage in passages:
-        travel, drop = passage.travel, passage.drop
+    for travel, drop in passages:
         top, bottom = np.quantile(drop, 0.98), np.quantile(drop, 0.1)
         change = float(top - bottom)
         if change <= 0:

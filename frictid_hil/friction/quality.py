@@ -21,8 +21,7 @@ from frictid_hil.friction.skew import MOST_APART, TimeSkew
 from frictid_hil.friction.trajectory import Array
 
 _USUAL = GateLimits()
-_RARE = 0.02
-"""Share of a cycle. A cosine of time spends as much of its period above cos(pi times it) of its peak."""
+_RARE = 0.02  # share of a cycle; a cosine is as long above cos(pi times it) of its peak
 _ROUGH_S = 0.008
 _AT_LIMIT = 0.98
 

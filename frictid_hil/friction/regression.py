@@ -20,16 +20,11 @@ from frictid_hil.friction.clustered import Prior, solve
 from frictid_hil.friction.recording import CycleRecording, Motion, around
 from frictid_hil.friction.trajectory import Array
 
-RIPPLE_ORDERS = (1.0, 2.0, 4.0)
-"""Periods per motor revolution: an eccentric shaft, the two lobes of a wave generator, their overtone."""
-GUARD_RAD = 0.005
-"""Travel left out after each reversal, where friction is still a spring; at most a twelfth of the amplitude."""
-EVEN_KNOTS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
-"""Speeds of the even part as shares of the highest: the asymmetry of directions changes slowly with speed."""
-BIAS_PRIOR = 0.15
-"""Over a short travel a constant and gravity look alike; a bias is expected within this share of the friction."""
-BEND_PRIOR = 0.005
-"""Above the slow knots a curve is expected to leave its neighbours' line by this share of the friction."""
+RIPPLE_ORDERS = (1.0, 2.0, 4.0)  # per motor revolution: an eccentric shaft, a wave generator's lobes, their overtone
+GUARD_RAD = 0.005  # travel after each reversal, where friction is still a spring; at most a twelfth of the amplitude
+EVEN_KNOTS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])  # shares of the highest speed: asymmetry changes slowly with it
+BIAS_PRIOR = 0.15  # over a short travel constant and gravity look alike: a bias within this share of the friction
+BEND_PRIOR = 0.005  # share of the friction by which a curve leaves its neighbours' line above the slow knots
 FINE = 0.1
 """Width of the kernel in radians of the fastest cycle. Three widths after each reversal are lost with what is guarded:
 at 0.2 a programme of two speeds saw nothing between the first and three quarters of the second, 0.3 % became 1.2 %."""
@@ -96,7 +91,7 @@ def fit(
     expected: tuple[float, ...] = (),
     doubtful: Array | None = None,  # columns of which the torque may hold more or less than was taken off, shape (n, m)
 ) -> Fit:
-    """Solve it on every sample that is not guarded; ``IdentificationError``: too few, or columns that are dependent."""
+    """Solve the model on every sample that is not guarded; ``IdentificationError``: too few, or dependent columns."""
     chosen = _choose(recording, motion, width_rad)
     observed = chosen.observed(motion, knots)
     columns, blocks = _columns(recording, motion, knots[observed], extra)

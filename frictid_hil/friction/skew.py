@@ -51,8 +51,7 @@ the shaking less than the slower cycles, (w tau)^2 / 3."""
 _LINK_SHARE, _LINK_MOST_S = 0.2, 300e-6
 """What a link on a spring takes is known to this share of the delay it would feign, beyond what its own uncertainty
 says; one that would feign more than this delay swings too much."""
-MOST_APART = 3.0
-"""Standard deviations between declared and measured beyond which the declaration is wrong: 0.3 % by chance."""
+MOST_APART = 3.0  # standard deviations beyond which the declaration is wrong: 0.3 % by chance
 DRAGGED = 3.0
 """Standard deviations by which effects outside the model may have moved the delay that is seen, about as far as ripple
 does (`benchmarks/interval_coverage.py`)."""

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frictid_hil.friction.consistency import MOST_SEEN_S
+from frictid_hil.friction.consistency import MOST_SEEN_S, friction_at
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.quality import gates
 from frictid_hil.friction.recording import synchronised
-from frictid_hil.friction.repetition import friction_at
 from frictid_hil.friction.rigid_body import Measured
 
 
