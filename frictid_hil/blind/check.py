@@ -14,12 +14,12 @@ import queue
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 from multiprocessing import get_context
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,7 @@ from frictid_hil.blind.worlds import WORLDS
 
 SCHEMA = "frictid.gap_check/1"
 
-Progress = Callable[[str, int, int], None]
-"""Called with the phase (``draw``, ``diagnose``, ``leave one out``), how many are done, and of how many."""
+Progress = Callable[[str, int, int], None]  # phase (``draw``, ``diagnose``, ``leave one out``), done, of
 DiagnoserCommand = tuple[str, ...]
 DIAGNOSER: DiagnoserCommand = (sys.executable, "-m", "frictid_hil.blind.diagnoser")
 
@@ -164,48 +163,30 @@ def _diagnosed(
     kept: _Kept,
 ) -> list[dict[str, Any]]:
     """All answers, in the order of the requests; a process that dies answers its request with its exit code."""
-    todo: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
-    done: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     by_case = kept.of(phase)
     asked = [request for request in requests if request["case"] not in by_case]
-    for request in asked:
-        todo.put(request)
-    workers = [
-        threading.Thread(target=_attend, args=(command, folder, todo, done), daemon=True)
-        for _ in range(min(max(processes, 1), len(asked)))
-    ]
-    for worker in workers:
-        todo.put(None)
-        worker.start()
-    for _ in asked:
-        answer = done.get()
-        kept.add(phase, answer)
-        by_case[answer["case"]] = answer
-        progress(phase, len(by_case), len(requests))
-    for worker in workers:
-        worker.join()
-    return [by_case[request["case"]] for request in requests]
+    idle: queue.SimpleQueue[subprocess.Popen[str]] = queue.SimpleQueue()
 
-
-def _attend(
-    command: DiagnoserCommand,
-    folder: Path,
-    todo: queue.SimpleQueue[dict[str, Any] | None],
-    done: queue.SimpleQueue[dict[str, Any]],
-) -> None:
-    """Feed one diagnosing process after another until the requests run out."""
-    process: subprocess.Popen[str] | None = None
-    while (request := todo.get()) is not None:
-        if process is None:
+    def answered(request: dict[str, Any]) -> dict[str, Any]:
+        try:
+            process = idle.get_nowait()
+        except queue.Empty:
             process = subprocess.Popen(command, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         answer = _asked(process, request)
         if answer is None:
-            answer = {"case": request["case"], "error": f"the diagnosing process ended with code {process.wait()}"}
-            process = None
-        done.put(answer)
-    if process is not None and process.stdin is not None:
-        process.stdin.close()
-        process.wait()
+            return {"case": request["case"], "error": f"the diagnosing process ended with code {process.wait()}"}
+        idle.put(process)
+        return answer
+
+    with ThreadPool(max(1, min(processes, len(asked)))) as pool:
+        for answer in pool.imap_unordered(answered, asked):
+            kept.add(phase, answer)
+            by_case[answer["case"]] = answer
+            progress(phase, len(by_case), len(requests))
+    while not idle.empty():
+        with idle.get():  # closed, and waited for
+            pass
+    return [by_case[request["case"]] for request in requests]
 
 
 def _asked(process: subprocess.Popen[str], request: dict[str, Any]) -> dict[str, Any] | None:

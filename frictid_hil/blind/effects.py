@@ -91,7 +91,7 @@ def _electrical_lag(rng: np.random.Generator, joint: Joint, peak_nm: float) -> C
     return {"lag": lag, "second_lag": float(rng.choice([0.0, 0.1])) * lag}
 
 
-LIBRARY: dict[str, Draw] = {
+LIBRARY: dict[str, Draw] = {  # every effect name of the diagnosis, with its draw
     # Friction is higher near rest and weakens with speed.
     "stribeck": lambda rng, j, _: {
         "weakening": j.physics.coulomb * log_uniform(rng, 0.02, 0.6),
@@ -143,7 +143,6 @@ LIBRARY: dict[str, Draw] = {
     "torque_bias": lambda rng, j, _: {"bias": j.physics.coulomb * either_sign(rng, 0.015, 0.35)},
     "electrical_lag": _electrical_lag,
 }
-"""Every effect name of the diagnosis, with its draw."""
 
 
 def _cable_spring(rng: np.random.Generator, joint: Joint, peak_nm: float) -> Changes:
@@ -167,7 +166,7 @@ def _bumper(rng: np.random.Generator, joint: Joint, peak_nm: float) -> Changes:
     }
 
 
-OUTSIDERS: dict[str, Draw] = {
+OUTSIDERS: dict[str, Draw] = {  # in no library: the right answer to each is ``unknown``
     # Friction follows the speed late, by tens of milliseconds.
     "frictional_memory": lambda rng, j, _: {"memory": log_uniform(rng, 0.012, 0.06)},
     # A worn place: friction is higher around one position.
@@ -219,7 +218,6 @@ OUTSIDERS: dict[str, Draw] = {
     # The drive now and then does not take a command and keeps the old one.
     "missed_commands": lambda rng, j, _: {"missed": rng.uniform(0.35, 0.9)},
 }
-"""Effects that no diagnosis has in its library: the right answer to each of them is ``unknown``."""
 
 
 def changed(effect: str, rng: np.random.Generator, joint: Joint, peak_nm: float) -> Changes:

@@ -24,13 +24,12 @@ from frictid_hil.blind.plant import TICK_S
 from frictid_hil.blind.score import PRACTICAL
 from frictid_hil.gap.experiments import FULL
 
-ALIASES = (
+ALIASES = (  # pairs that these columns can hardly separate
     ("torque_bias", "direction_asymmetry"),
     ("torque_delay", "electrical_lag"),
     ("stribeck", "stiction_breakaway"),
     ("encoder_offset", "gravity_error"),
 )
-"""Pairs that these columns can hardly separate."""
 
 VISIBLE = 1.5  # gap over floor from which an effect counts as visible
 SMALL, MEDIUM = 4.0, 12.0
@@ -73,7 +72,7 @@ def assignments(cases: int, seed: int) -> tuple[Assignment, ...]:
 
 
 def draw_case(index: int, seed: int, assignment: Assignment, experiments: tuple[str, ...] = FULL) -> Case:
-    """The same from the same arguments, whatever else is drawn; anew where its controller cannot hold the joint."""
+    """One case, the same from the same arguments; the joint is drawn anew where its controller cannot hold it."""
     for attempt in range(50):
         rng = np.random.default_rng([seed, 202, index, attempt])
         noise_seed = [seed, 303, index, attempt]

@@ -1,7 +1,7 @@
 """Joints to be diagnosed: a healthy joint drawn at random, and what a simulator believes of it.
 
-Sizes are drawn log-uniformly over those of small to large robot joints. The belief differs from the joint by
-tolerances of up to 0.8 %, and every joint carries traces of effects below its own torque noise: neither is a cause.
+The belief differs by tolerances of up to 0.8 %, and every joint carries traces of effects below its own torque noise:
+neither is a cause.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Scores of the wide world and the zoo: what is named first, false all-clears, confidence against truth, intervals.
 
 A truth names the causes that are right first (``main``), those that are there (``present``), those that are neither
-right nor wrong (``neutral``), and for each contributor what can't be told from it. Every rate has its Wilson interval.
+(``neutral``), and what can't be told from each contributor.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.blind.generator import VISIBLE
-from frictid_hil.blind.score import CONFIDENT, Answer, Rate, not_taken_in, times
+from frictid_hil.blind.score import CONFIDENT, Answer, Rate, counted, not_taken_in, times
 
 FALSE_CLEAR = 3.0  # gap over floor from which ``none`` is a false all-clear
 BINS = 10  # of confidence, for the calibration error
@@ -27,11 +27,12 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
     wrong = [(t, a) for t, a, _ in cases if t["kind"] in ("tolerance", "single", "double")]
     visible = [(t, a) for t, a in wrong if t["size_ratio"] >= VISIBLE]
     named = [(t, effect, chance) for t, a, _ in cases if a.named for effect, chance in a.causes]
-    sure = [_wrong(t, a) for t, a, _ in cases if a.confidence >= CONFIDENT]
+    # A first cause that is neither there nor not is no mistake.
+    sure = [not _there(t, a.first) and a.first not in t["neutral"] for t, a, _ in cases if a.confidence >= CONFIDENT]
     off = [(t, a) for t, a in visible if LEVEL in t["main"]]
 
     def first(chosen: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
-        return Rate.over(_right(t, a) for t, a in chosen).to_json()
+        return counted(_right(t, a) for t, a in chosen)
 
     def by(key: str) -> dict[str, Any]:
         found = sorted({str(t[key]) for t, _ in visible})
@@ -43,18 +44,18 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
         "first": first(visible),
         "first_by_kind": by("kind"),
         "first_by_controller": by("controller"),
-        "first_or_tied": Rate.over(_right(t, a) or a.first in _tied(t) for t, a in visible).to_json(),
-        "none": Rate.over(a.verdict == "none" for t, a, _ in cases if t["kind"] == "none").to_json(),
+        "first_or_tied": counted(_right(t, a) or a.first in _tied(t) for t, a in visible),
+        "none": counted(a.verdict == "none" for t, a, _ in cases if t["kind"] == "none"),
         "first_of_all": first(wrong),
-        "outside": Rate.over(not_taken_in(t, a) for t, a, _ in cases if t["kind"] == "outside").to_json(),
-        "false_none": Rate.over(
+        "outside": counted(not_taken_in(t, a) for t, a, _ in cases if t["kind"] == "outside"),
+        "false_none": counted(
             a.verdict == "none" for t, a, _ in cases if t["size_ratio"] >= FALSE_CLEAR
-        ).to_json(),
+        ),
         "sure_and_wrong": Rate(sum(sure), len(cases)).to_json(),
-        "friction_level_taken_for_another": Rate.over(
+        "friction_level_taken_for_another": counted(
             a.confidence >= 0.5 and a.first not in (*t["main"], *_tied(t)) for t, a in off
-        ).to_json(),
-        "parameters": Rate.over(held for t, _, d in cases for held in _held(t, d)).to_json(),
+        ),
+        "parameters": counted(held for t, _, d in cases for held in _held(t, d)),
         "brier": float(np.mean([(c - _there(t, e)) ** 2 for t, e, c in named])) if named else None,
         "calibration_error": _calibration_error([(c, _there(t, e)) for t, e, c in named]),
         "confusion": _confusion([(t, a) for t, a, _ in cases]),
@@ -124,11 +125,6 @@ def _tied(truth: Mapping[str, Any]) -> set[str]:
 
 def _there(truth: Mapping[str, Any], effect: str) -> bool:
     return effect in (*truth["present"], *truth["main"]) or effect in _tied(truth)
-
-
-def _wrong(truth: Mapping[str, Any], answer: Answer) -> bool:
-    """The first cause is not there; one that is neither there nor not is no mistake."""
-    return not _there(truth, answer.first) and answer.first not in truth["neutral"]
 
 
 def _held(truth: Mapping[str, Any], document: Mapping[str, Any]) -> list[bool]:

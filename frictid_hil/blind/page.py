@@ -14,7 +14,7 @@ last full run, failures included.
 """
 
 
-_RATES = {
+_RATES = {  # by name: where they stand in the scores, and what they are called
     "singles_top_1": ("singles", "top_1", "Visible single effects named first"),
     "singles_top_1_or_alias": ("singles", "top_1_or_alias", "... or its alias"),
     "singles_top_2": ("singles", "top_2", "... among the first two"),
@@ -31,8 +31,7 @@ _RATES = {
     "confident_right": ("confident", "right", "Answers of confidence 0.9 and more that are right"),
     "confident_right_or_alias": ("confident", "right_or_alias", "... or the alias of right"),
 }
-"""The rates that a person asks for first, by name: where they stand in the scores, and what they are called."""
-AIMS = {
+AIMS = {  # that the diagnosis is to reach
     "singles_top_1": 0.97,
     "singles_top_2": 0.98,
     "none_answered_none": 0.97,
@@ -40,7 +39,6 @@ AIMS = {
     "doubles_both_in_top_2": 0.85,
     "confident_right": 0.95,
 }
-"""Rates that the diagnosis is to reach."""
 CLOSED_AIMS = {"median": 0.97, "p10": 0.85}
 _QUANTILES = {"median": "median", "p10": "10 % quantile"}
 SECONDS_AIM = 5.0

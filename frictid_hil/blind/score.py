@@ -21,7 +21,7 @@ PROMISED = 2.0  # gap over floor below which a verdict may be ``none``, whatever
 PRACTICAL = 0.05  # the same over the believed friction level
 BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0)
 
-PARTNERS = (
+PARTNERS = (  # of traces alike; the other one at low confidence is an honest answer
     ("torque_bias", "direction_asymmetry"),
     ("torque_bias", "encoder_offset"),
     ("encoder_offset", "gravity_error"),
@@ -30,7 +30,6 @@ PARTNERS = (
     ("torque_delay", "electrical_lag"),
     ("presliding_hysteresis", "torque_delay"),
 )
-"""Pairs whose traces in a recording are alike; within one, the partner at low confidence is an honest answer."""
 
 # A figure the tool reports may differ from truth's by its own choice of filter, not by more.
 AGREEMENT = 1.25
@@ -91,12 +90,6 @@ class Rate:
     right: int
     of: int
 
-    @staticmethod
-    def over(outcomes: Iterable[bool]) -> Rate:
-        """Counted from outcomes."""
-        counted = list(outcomes)
-        return Rate(sum(counted), len(counted))
-
     @property
     def share(self) -> float | None:
         """None where nothing was counted."""
@@ -119,13 +112,20 @@ class Rate:
         return {"rate": self.share, "low": low, "high": high, "right": self.right, "of": self.of}
 
 
+def counted(outcomes: Iterable[bool]) -> dict[str, Any]:
+    """A rate counted from outcomes, plain values."""
+    every = list(outcomes)
+    return Rate(sum(every), len(every)).to_json()
+
+
 def score(truths: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Answer]) -> dict[str, Any]:
     """Every rate of the blind check, plain values; by case name. A case without an answer counts as an error."""
     cases = [(truth, answers.get(name, Answer("error", message="no answer"))) for name, truth in truths.items()]
     visible = [(t, a) for t, a in cases if t["visible"]]
     singles = [(t, a) for t, a in visible if t["kind"] == "single"]
     doubles = [(t, a) for t, a in visible if t["kind"] == "double"]
-    apart = [(t, a) for t, a in doubles if _both_visible(t)]
+    # Truth files without that figure do not say otherwise.
+    apart = [(t, a) for t, a in doubles if all(e.get("size_ratio_alone", math.inf) >= 1.5 for e in t["effects"])]
     healthy = [(t, a) for t, a in cases if t["kind"] == "none"]
     outside = [(t, a) for t, a in visible if t["kind"] == "outside"]
     confident = [(t, a) for t, a in cases if a.confidence >= CONFIDENT]
@@ -133,31 +133,31 @@ def score(truths: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Answer]
         "cases": len(cases),
         "errors": [{"case": t["case"], "message": a.message} for t, a in cases if a.verdict == "error"],
         "singles": _singles(singles),
-        "invisible": Rate.over(
+        "invisible": counted(
             a.first in ("none", "unknown") if t["kind"] == "outside" else a.first in ("none", *_names(t))
             for t, a in cases
             if not t["visible"]
-        ).to_json(),
+        ),
         "none": {
-            "answered_none": Rate.over(a.verdict == "none" for _, a in healthy).to_json(),
-            "false_alarms": Rate.over(a.verdict != "none" for _, a in healthy).to_json(),
+            "answered_none": counted(a.verdict == "none" for _, a in healthy),
+            "false_alarms": counted(a.verdict != "none" for _, a in healthy),
         },
         "outside": {
-            "answered_unknown": Rate.over(not_taken_in(t, a) for t, a in outside).to_json(),
-            "unknown_alone": Rate.over(a.verdict == "unknown" for _, a in outside).to_json(),
+            "answered_unknown": counted(not_taken_in(t, a) for t, a in outside),
+            "unknown_alone": counted(a.verdict == "unknown" for _, a in outside),
             "by_effect": {
-                name: Rate.over(not_taken_in(t, a) for t, a in outside if _name(t) == name).to_json()
+                name: counted(not_taken_in(t, a) for t, a in outside if _name(t) == name)
                 for name in sorted({_name(t) for t, _ in outside})
             },
         },
         "doubles": {
-            "both_in_top_2": Rate.over(set(_names(t)) <= set(a.named[:2]) for t, a in apart).to_json(),
-            "both_in_top_2_all": Rate.over(set(_names(t)) <= set(a.named[:2]) for t, a in doubles).to_json(),
-            "at_least_one_in_top_2": Rate.over(bool(set(_names(t)) & set(a.named[:2])) for t, a in apart).to_json(),
+            "both_in_top_2": counted(set(_names(t)) <= set(a.named[:2]) for t, a in apart),
+            "both_in_top_2_all": counted(set(_names(t)) <= set(a.named[:2]) for t, a in doubles),
+            "at_least_one_in_top_2": counted(bool(set(_names(t)) & set(a.named[:2])) for t, a in apart),
         },
         "confident": {
-            "right": Rate.over(a.first in _names(t) for t, a in confident).to_json(),
-            "right_or_alias": Rate.over(_same_or_alias(t, a) for t, a in confident).to_json(),
+            "right": counted(a.first in _names(t) for t, a in confident),
+            "right_or_alias": counted(_same_or_alias(t, a) for t, a in confident),
         },
         "calibration": _calibration(cases),
         "closed": {
@@ -178,12 +178,11 @@ def _singles(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any
     """Joints with one effect, all and by its size."""
 
     def tops(chosen: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
-        first, second = (Rate.over(_name(t) in a.ranking[:count] for t, a in chosen) for count in (1, 2))
-        return {"top_1": first.to_json(), "top_2": second.to_json()}
+        return {f"top_{count}": counted(_name(t) in a.ranking[:count] for t, a in chosen) for count in (1, 2)}
 
     return {
         **tops(cases),
-        "top_1_or_alias": Rate.over(_same_or_alias(t, a) for t, a in cases).to_json(),
+        "top_1_or_alias": counted(_same_or_alias(t, a) for t, a in cases),
         "by_size": {
             size: tops([(t, a) for t, a in cases if t["size_class"] == size]) for size in ("small", "medium", "large")
         },
@@ -200,9 +199,9 @@ def score_left_out(answers: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[
     return {
         "joints": len(answers),
         "errors": [{"case": t["case"], "message": a.message} for t, a in answers if a.verdict == "error"],
-        "confident_wrong": Rate.over(a.confidence >= CONFIDENT and not partner(t, a) for t, a in answers).to_json(),
-        "confident_partner": Rate.over(a.confidence >= CONFIDENT and partner(t, a) for t, a in answers).to_json(),
-        "answered_unknown": Rate.over(a.verdict == "unknown" for _, a in answers).to_json(),
+        "confident_wrong": counted(a.confidence >= CONFIDENT and not partner(t, a) for t, a in answers),
+        "confident_partner": counted(a.confidence >= CONFIDENT and partner(t, a) for t, a in answers),
+        "answered_unknown": counted(a.verdict == "unknown" for _, a in answers),
         "wrong_causes": [
             {
                 "case": t["case"],
@@ -232,11 +231,6 @@ def _names(truth: Mapping[str, Any]) -> tuple[str, ...]:
 def _same_or_alias(truth: Mapping[str, Any], answer: Answer) -> bool:
     pairs = [set(pair) for pair in truth["aliases"]]
     return any(answer.first == name or {answer.first, name} in pairs for name in _names(truth))
-
-
-def _both_visible(truth: Mapping[str, Any]) -> bool:
-    """Each of two effects would be visible alone; truth files without that figure do not say otherwise."""
-    return all(effect.get("size_ratio_alone", math.inf) >= 1.5 for effect in truth["effects"])
 
 
 def not_taken_in(truth: Mapping[str, Any], answer: Answer) -> bool:
@@ -273,8 +267,7 @@ def _calibration(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> list[dict
     for low, high in itertools.pairwise(BINS):
         inside = [(c, right) for c, right in named if low <= c < high or (high == 1.0 and c == 1.0)]
         mean = _summed(np.mean, [c for c, _ in inside])
-        rate = Rate.over(right for _, right in inside).to_json()
-        rows.append({"from": low, "to": high, "mean_confidence": mean, **rate})
+        rows.append({"from": low, "to": high, "mean_confidence": mean, **counted(right for _, right in inside)})
     return rows
 
 

@@ -20,20 +20,15 @@ from frictid_hil.blind.wide import Drawn, Row
 from frictid_hil.blind.zoo import truth_of
 from frictid_hil.friction.trajectory import Array
 
-SOURCES = {"FRICTID_REAL_MORE_DATA": "real-more"}
-"""Environment variables that name folders of recordings with ``cases/``; else beside the repository, in shared/data."""
 ADDED = ("torque_bias", "torque_ripple", "direction_asymmetry", "torque_constant_error")
-TIMES = (4.0, 12.0)
-"""Size of what is added over what the slow part of the torque shows. Where a third of a gap stays, nothing is named."""
+TIMES = (4.0, 12.0)  # size of what is added over what shows already; where a third of a gap stays, nothing is named
 
 
 def recorded_sets() -> tuple[Path, ...]:
     """Folders of real sets with a torque; empty where none are here."""
-    found: list[Path] = []
-    for variable, name in SOURCES.items():
-        told = os.environ.get(variable)
-        folder = Path(told) if told else Path(__file__).resolve().parents[3] / "shared" / "data" / name
-        found += [path.parent for path in sorted((folder / "cases").glob("*/nominal.yaml"))]
+    told = os.environ.get("FRICTID_REAL_MORE_DATA")  # with ``cases/``; else beside the repository, in shared/data
+    folder = Path(told) if told else Path(__file__).resolve().parents[3] / "shared" / "data" / "real-more"
+    found = (path.parent for path in sorted((folder / "cases").glob("*/nominal.yaml")))
     return tuple(path for path in found if "torque_nm" in _header(path))
 
 

@@ -35,8 +35,7 @@ FORMS = ("presliding_hysteresis", "viscous_nonlinearity", "stribeck", "stiction_
 """What that may rightly be called."""
 PAIRS = 14
 TIE = 0.35  # a single cause that leaves less of another one than this, in floors, can't be told from it
-DRIVE = ("torque_delay", "electrical_lag", "torque_saturation")
-"""Effects that nobody sees without knowing the controller."""
+DRIVE = ("torque_delay", "electrical_lag", "torque_saturation")  # nobody sees them without the controller
 _LEFT_OUT = ("velocity_lag", "encoder_quantisation", "temperature_drift", "backlash", "joint_elasticity")
 """Effects of the narrow world that these sizes do not measure, or that a pick-and-place log hardly shows."""
 
@@ -122,7 +121,7 @@ _SIZES: dict[str, tuple[tuple[float, float], tuple[int, ...], tuple[float, float
 
 
 def draw_wide(index: int, seed: int, kind: str) -> Drawn:
-    """The same from the same arguments; drawn anew where it cannot be held, or what is withheld not be seen."""
+    """One case, the same from the same arguments; drawn anew where it is not held, or what is withheld not seen."""
     for attempt in range(200):
         rng = np.random.default_rng([seed, 404, index, attempt])
         setting = _setting(rng)
@@ -147,9 +146,6 @@ def draw_wide(index: int, seed: int, kind: str) -> Drawn:
         name = f"case_{index:03d}"
         return _nominal(name, setting), logs, _truth(name, kind, setting, base, reasons, total, floor, form)
     raise RuntimeError(f"no joint came up for case {index} of kind {kind}")
-
-
-# -- the joint ----------------------------------------------------------------------------------------------------
 
 
 def _sized(rng: np.random.Generator, size: str) -> tuple[float, Physics, Payload, float, float]:
@@ -283,9 +279,6 @@ def _with_traces(rng: np.random.Generator, physics: Physics, floor_nm: float) ->
     return physics
 
 
-# -- what it is asked to do ---------------------------------------------------------------------------------------
-
-
 def _motions(rng: np.random.Generator, kind: str, speed: float, tick: float, posed: bool) -> tuple[Motion, ...]:
     centre = rng.uniform(-1.6, 1.6) if posed else 0.0
     if kind in ("full", "short"):
@@ -321,9 +314,6 @@ def pick_place(rng: np.random.Generator, speed: float, seconds: float, tick: flo
         pieces.append(np.full(round(rng.uniform(0.1, 0.8) / tick), to))
         at = to
     return np.concatenate(pieces)
-
-
-# -- what differs from the belief ---------------------------------------------------------------------------------
 
 
 def _tolerances(rng: np.random.Generator, setting: Setting) -> list[Contributor]:
@@ -364,18 +354,16 @@ def _share(name: str, e: float, role: str = "tolerance") -> Contributor:
 
 def _gains(setting: Setting, gains: Sequence[float], role: str = "tolerance") -> Contributor:
     named = {f"{n}_error_share": g - 1 for n, g in zip(("kp", "ki", "kd"), gains, strict=True)}
-
-    def change(p: Physics, c: Controller) -> Changed:
-        return p, c._replace(kp=c.kp * gains[0], ki=c.ki * gains[1], kd=c.kd * gains[2])
-
-    return Contributor("controller_gain_error", role, named if setting.law != "cascade" else {}, change)
+    return Contributor(
+        "controller_gain_error",
+        role,
+        named if setting.law != "cascade" else {},
+        lambda p, c: (p, c._replace(kp=c.kp * gains[0], ki=c.ki * gains[1], kd=c.kd * gains[2])),
+    )
 
 
 def _scaling(factors: dict[str, float]) -> Callable[[Physics, Controller], Changed]:
-    def change(p: Physics, c: Controller) -> Changed:
-        return p._replace(**{name: getattr(p, name) * factor for name, factor in factors.items()}), c
-
-    return change
+    return lambda p, c: (p._replace(**{name: getattr(p, name) * factor for name, factor in factors.items()}), c)
 
 
 def _replacing(values: dict[str, Any]) -> Callable[[Physics, Controller], Changed]:
@@ -444,8 +432,6 @@ def _as_narrow(setting: Setting) -> Joint:
     )  # fmt: skip
 
 
-# -- sizes ----------------------------------------------------------------------------------------------------------
-
 Run = tuple[Array, Array, Array]
 """Position, torque and what the believed controller would have asked for along it; at the control ticks."""
 
@@ -463,11 +449,11 @@ def _runs(setting: Setting, physics: Physics, control: Controller) -> list[Run] 
         reach = 0.12 * max(float(np.ptp(motion.command)), 0.3) + 0.05
         if not np.all(np.isfinite(error)) or np.abs(error).max() > 2.0 * reach or np.ptp(error[-100:]) > reach:
             return None
-        runs.append((position, torque, _asked(setting.control, motion.command, position, float(torque[0]))))
+        runs.append((position, torque, asked(setting.control, motion.command, position, float(torque[0]))))
     return runs
 
 
-def _asked(c: Controller, command: Array, position: Array, start_nm: float) -> Array:
+def asked(c: Controller, command: Array, position: Array, start_nm: float) -> Array:
     """The believed law along a motion, without its limit; row k acts from tick k on."""
     velocity = np.diff(position, prepend=position[0]) / c.tick
     filtered = lagging(velocity, c.tick, c.velocity_filter)
@@ -475,10 +461,10 @@ def _asked(c: Controller, command: Array, position: Array, start_nm: float) -> A
     bend = np.gradient(np.gradient(command, c.tick), c.tick)
     error = command - position
     total = np.concatenate([[0.0], np.cumsum(c.ki * error * c.tick)[:-1]])
-    asked: Array = c.kp * (c.command_weight * command - position) + total + c.inertia_ahead * bend
-    asked = asked + c.kd * (c.rate_weight * rate - filtered)
-    asked += start_nm - asked[0]
-    return asked
+    demand: Array = c.kp * (c.command_weight * command - position) + total + c.inertia_ahead * bend
+    demand = demand + c.kd * (c.rate_weight * rate - filtered)
+    demand += start_nm - demand[0]
+    return demand
 
 
 def _floor(setting: Setting) -> float:
@@ -588,9 +574,6 @@ def _as_wanted(kind: str, reasons: Sequence[Contributor], total: float) -> bool:
     return min(own) >= WITHHELD and max(own) < 80.0 and min(own) >= within
 
 
-# -- what is written --------------------------------------------------------------------------------------------------
-
-
 def _recorded(rng: np.random.Generator, setting: Setting, physics: Physics, control: Controller) -> tuple[Row, ...]:
     rows, heat, clock = [], 0.0, 0.0
     for motion in setting.motions:
@@ -633,10 +616,7 @@ def _nominal(name: str, setting: Setting) -> dict[str, Any]:
                 "presliding_stiffness_nm_per_rad": p.coulomb / p.slip_length,
             },
         },
-        "drive": {
-            "rated_torque_nm": setting.rated_nm,
-            "torque_quantum_nm": 1e-3 * setting.rated_nm,
-        },
+        "drive": {"rated_torque_nm": setting.rated_nm, "torque_quantum_nm": 1e-3 * setting.rated_nm},
         "encoder": {"resolution_rad": p.encoder_step},
         "tolerance": {**setting.tolerance, "absolute": setting.absolute},
         "experiments": told_experiments(
@@ -740,10 +720,13 @@ def _tied(setting: Setting, base: Sequence[Run], reason: Contributor, floor_nm: 
     target = np.concatenate(changed["torque"])
     p, tick = setting.physics, setting.control.tick
     columns: dict[str, list[Array]] = {}
+    bare = _bare(p)
     for (q, torque, _), motion in zip(base, setting.motions, strict=True):
         smooth = low_pass(q, 1.0 / tick)
         v = np.gradient(smooth, tick)
-        s, rate = np.tanh(v / (0.01 * np.abs(v).max())), np.sign(v) * _rates(p, v)
+        grid = np.linspace(0.0, float(np.abs(v).max()), 60)
+        rate = np.sign(v) * np.interp(np.abs(v), grid, [float(plant.rate_part(bare, speed)) for speed in grid])
+        s = np.tanh(v / (0.01 * np.abs(v).max()))
         gravity = p.gravity + (setting.payload.gravity_nm if motion.payload else 0.0)
         for name, column in {
             "torque_bias": np.ones_like(q), "gravity_error": np.cos(q), "encoder_offset": gravity * np.sin(q),
@@ -760,10 +743,3 @@ def _tied(setting: Setting, base: Sequence[Run], reason: Contributor, floor_nm: 
         if name != reason.name and rms(left) < TIE * floor_nm:
             tied.append(name)
     return tied
-
-
-def _rates(p: Physics, v: Array) -> Array:
-    bare = _bare(p)
-    grid = np.linspace(0.0, float(np.abs(v).max()), 60)
-    rates: Array = np.interp(np.abs(v), grid, np.array([float(plant.rate_part(bare, speed)) for speed in grid]))
-    return rates

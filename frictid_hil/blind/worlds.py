@@ -1,7 +1,6 @@
 """The worlds that a diagnosis is checked in: how each deals, draws and scores its joints.
 
-``narrow``: joints close to their beliefs, eight experiments (``generator``). ``wide``: joints as they come in practice.
-``zoo``: joints of MuJoCo, and real recordings with an effect added.
+``narrow``: close to their beliefs, eight experiments. ``wide``: as they come in practice. ``zoo``: of MuJoCo, and real.
 """
 
 from __future__ import annotations

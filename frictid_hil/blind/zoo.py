@@ -1,7 +1,6 @@
 """Joints that others wrote: MuJoCo's DC motor with its LuGre friction and cogging, driven by a digital controller.
 
-Nothing here computes friction, inertia or gravity: the real joint and the believed one are two MJCF models that differ
-in what is withheld. Real recordings with an effect added in software are the other half (``spoilt``).
+The real joint and the believed one are two MJCF models that differ in what is withheld; nothing is computed here.
 """
 
 from __future__ import annotations
@@ -10,13 +9,15 @@ import importlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from frictid_hil.blind.figures import lagging, low_pass, rms
+from frictid_hil.blind.figures import low_pass, rms
 from frictid_hil.blind.joints import either_sign, log_uniform, told_body, told_experiments
-from frictid_hil.blind.wide import Drawn, Row, multisine, pick_place
+from frictid_hil.blind.plant import Controller
+from frictid_hil.blind.wide import Drawn, Row, asked, multisine, pick_place
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Array
 
@@ -72,11 +73,11 @@ def draw_zoo(index: int, seed: int, kind: str) -> Drawn:
         if not all(np.all(np.isfinite(r[0])) and np.abs(r[0] - motions[n]).max() < 0.5 for n, (_, r) in pairs.items()):
             continue
         floor = rms(low_pass(noise * rng.standard_normal(20_000), 1.0 / TICK_S))
-        late = rms(
-            np.concatenate([low_pass(_late(c, real, gains, pairs[n][1]), 1.0 / TICK_S) for n, c in motions.items()])
-        )
+        # What the controller asked for a tick before is not what was given.
+        late = [t[1:] - asked(gains, motions[n], q, float(t[0]))[:-1] for n, (_, (q, t)) in pairs.items()]
         changed = rms(np.concatenate([low_pass(r[1] - b[1], 1.0 / TICK_S) for b, r in pairs.values()]))
-        size = max(changed, late if kind != "none" else 0.0) / floor
+        apart = rms(np.concatenate([low_pass(part, 1.0 / TICK_S) for part in late]))
+        size = max(changed, apart if kind != "none" else 0.0) / floor
         if kind != "none" and not VISIBLE <= size < 80.0:
             continue
         case = f"case_{index:03d}"
@@ -163,23 +164,16 @@ def _xml(m: Model) -> str:
  cogging="{m.cogging:.12g} {m.poles * GEAR_RATIO} 0.4"/></actuator></mujoco>"""
 
 
-@dataclass(frozen=True, slots=True)
-class Gains:
-    """A PID with backward differences, at ``TICK_S``."""
-
-    kp: float
-    ki: float
-    kd: float
-    filter_s: float = 0.004
+Gains = partial(Controller, velocity_filter=0.004, torque_limit=math.inf, tick=TICK_S, backward=True)
 
 
-def _gains(rng: np.random.Generator, m: Model) -> Gains:
+def _gains(rng: np.random.Generator, m: Model) -> Controller:
     inertia, natural, damping = m.inertia + m.armature, rng.uniform(20.0, 28.0), rng.uniform(0.75, 0.95)
     kp = inertia * natural**2
     return Gains(kp, kp * rng.uniform(2.0, 4.0), 2.0 * damping * natural * inertia)
 
 
-def run(m: Model, gains: Gains, command: Array) -> tuple[Array, Array]:
+def run(m: Model, gains: Controller, command: Array) -> tuple[Array, Array]:
     """(position, mean torque since the last tick) at the ticks, from rest, (n,) each; ``UsageError`` without MuJoCo."""
     try:
         library = importlib.import_module("mujoco")
@@ -194,9 +188,9 @@ def run(m: Model, gains: Gains, command: Array) -> tuple[Array, Array]:
     if m.lag:
         data.act[0] = holding
     late = round(m.delay / TICK_S)
-    asked = [holding] * late
+    sent = [holding] * late
     integral, filtered, last = holding, 0.0, float(command[0])
-    keep = math.exp(-TICK_S / gains.filter_s)
+    keep = math.exp(-TICK_S / gains.velocity_filter)
     position, torque = np.empty(command.size), np.empty(command.size)
     given, steps = holding, round(TICK_S / STEP_S)
     for k in range(command.size):
@@ -206,27 +200,15 @@ def run(m: Model, gains: Gains, command: Array) -> tuple[Array, Array]:
         last = q
         rate = (command[k] - command[max(k - 1, 0)]) / TICK_S
         behind = command[k] - q
-        asked.append(gains.kp * behind + integral + gains.kd * (rate - filtered))
+        sent.append(gains.kp * behind + integral + gains.kd * (rate - filtered))
         integral += gains.ki * behind * TICK_S
-        data.ctrl[0] = asked.pop(0)
+        data.ctrl[0] = sent.pop(0)
         given = 0.0
         for _ in range(steps):
             data.qfrc_applied[0] = m.bias + m.shake * math.sin(2 * math.pi * m.shake_hz * data.time)
             library.mj_step(model, data)
             given += float(data.actuator_force[0]) / m.gain / steps
     return position, torque
-
-
-def _late(command: Array, m: Model, gains: Gains, made: tuple[Array, Array]) -> Array:
-    """Torque less what the controller asked for a tick before."""
-    position, torque = made
-    velocity = np.diff(position, prepend=position[0]) / TICK_S
-    filtered = lagging(velocity, TICK_S, gains.filter_s)
-    rate = np.diff(command, prepend=command[0]) / TICK_S
-    error = command - position
-    demand = gains.kp * error + gains.kd * (rate - filtered)
-    demand += torque[0] + np.concatenate([[0.0], np.cumsum(gains.ki * error * TICK_S)[:-1]])
-    return torque[1:] - demand[:-1]
 
 
 def _log(
@@ -244,7 +226,7 @@ def _log(
     return Row(name, columns)
 
 
-def _nominal(case: str, b: Model, g: Gains, rated: float, motions: Mapping[str, Array]) -> dict[str, Any]:
+def _nominal(case: str, b: Model, g: Controller, rated: float, motions: Mapping[str, Array]) -> dict[str, Any]:
     speeds = [0.25 * k for k in range(1, 9)]
     return {
         "case": case,
@@ -258,7 +240,7 @@ def _nominal(case: str, b: Model, g: Gains, rated: float, motions: Mapping[str, 
         },
         "controller": {
             "type": "pid", "rate_hz": round(1.0 / TICK_S), "kp": g.kp, "ki": g.ki, "kd": g.kd,
-            "velocity_filter_s": g.filter_s, "command_rate": "backward",
+            "velocity_filter_s": g.velocity_filter, "command_rate": "backward",
         },
         "drive": {"rated_torque_nm": rated, "torque_quantum_nm": 1e-3 * rated},
         "encoder": {"resolution_rad": 2.0 * math.pi / (2**17 * GEAR_RATIO)},
