@@ -1,12 +1,9 @@
 """Files of arrays: ``.npz``, HDF5 (also MATLAB 7.3), parquet, and LeRobot datasets; every array of numbers is a column.
 
 Pickled objects are refused; an array's size is checked before any of it is read. A LeRobot dataset is a folder with
-``meta/info.json`` and parquet files, one or more episodes each. Its lists are named by the names of its ``info.json``
-(``observation.state/shoulder_pan.pos``). It does not say their unit, and its time is made up from the frame rate: both
-are told. Recordings of the friction tools BAM (JSON) and PACE (``.pt``, written by torch) are read, too.
-
-What is unreadable, larger than it may be, of another kind, or needs a library that is not installed, is refused by an
-``InputFileError``.
+``meta/info.json``, which names its lists (``observation.state/shoulder_pan.pos``), and parquet files of episodes; that
+its units are not said, and its time is made up from the frame rate, is told. Recordings of the friction tools BAM
+(JSON) and PACE (``.pt``, of torch) are read, too. What cannot be read, or lacks its library, is an ``InputFileError``.
 """
 
 from __future__ import annotations

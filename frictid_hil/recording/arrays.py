@@ -1,7 +1,6 @@
 """Tables made of named arrays: what .mat, npz, HDF5, parquet, ROS and JSON logs come down to.
 
-A matrix of n rows and k columns is known by its name and an ``index``, and each of its columns as ``name/0``,
-``name/1``, ... or by the label that the file gives it.
+A column of a matrix is its name and an ``index``, or ``name/0``, ``name/1``, ... or ``name/`` and the file's label.
 """
 
 from __future__ import annotations

@@ -6,8 +6,7 @@ Layout, as python-can reads it: a file header of 144 bytes, then log containers,
     frame:     LOBJ | header 32, version 1, size 48, type 1 | flags 2 (ns), time u64 | channel, flags, dlc, id, 8 bytes
     FD frame:  LOBJ | header 32, version 1, size 120, type 100 | flags 2, time | channel, flags, dlc, id, ..., 64 bytes
 
-The start time in the file header stays zero, so a time read back is the run time written, to the nanosecond; the
-counts in the header are filled in at the end, and a file that was never closed is read by their absence.
+The start time in the file header stays zero: times are run time. The counts there are filled in at the end.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ _HEAD: list[tuple[str, str]] = [
 ]
 FRAME = np.dtype([*_HEAD, ("data", "u1", 8)])  # A classic CAN frame, 48 bytes; bit 31 of the id says extended
 
-FD_FRAME_OBJECT = np.dtype(
+FD_FRAME_OBJECT = np.dtype(  # a CAN FD frame, 120 bytes
     [
         *_HEAD,
         ("frame_ns", "<u4"),
@@ -57,7 +56,6 @@ FD_FRAME_OBJECT = np.dtype(
         ("data", "u1", 64),
     ]
 )
-"""A CAN FD frame, 120 bytes."""
 
 _FD_LENGTHS = np.array([*range(9), 12, 16, 20, 24, 32, 48, 64], np.uint8)  # by dlc
 
@@ -107,25 +105,24 @@ def frames_in(content: bytes) -> tuple[NDArray[np.void], NDArray[np.void], NDArr
         alike = (every["signature"] == b"LOBJ") & (every["type"] == CAN_FRAME) & (every["size"] == FRAME.itemsize)
         if alike.all():
             return every, np.zeros(0, FD_FRAME_OBJECT), np.arange(every.size)
-    sizes = {CAN_FRAME: FRAME.itemsize, CAN_FD_FRAME: FD_FRAME_OBJECT.itemsize}
-    begins: dict[int, list[int]] = {CAN_FRAME: [], CAN_FD_FRAME: []}
-    places: dict[int, list[int]] = {CAN_FRAME: [], CAN_FD_FRAME: []}
-    at = count = 0
+    layouts = {CAN_FRAME: FRAME, CAN_FD_FRAME: FD_FRAME_OBJECT}
+    begins: list[tuple[int, int]] = []
+    at = 0
     while at + OBJECT_HEAD.size <= len(content):
         signature, _, _, size, kind = OBJECT_HEAD.unpack_from(content, at)
-        if signature != b"LOBJ" or sizes.get(kind) != size:
+        if signature != b"LOBJ" or kind not in layouts or layouts[kind].itemsize != size:
             return None
         if at + size > len(content):
             break
-        begins[kind].append(at)
-        places[kind].append(count)
-        at, count = at + size, count + 1
-    raw = np.frombuffer(content, np.uint8)
-    found = []
-    for kind, layout in ((CAN_FRAME, FRAME), (CAN_FD_FRAME, FD_FRAME_OBJECT)):
-        starts = np.array(begins[kind], np.intp)
-        found.append(raw[starts[:, None] + np.arange(layout.itemsize)].view(layout)[:, 0])
-    return found[0], found[1], np.array(places[CAN_FRAME] + places[CAN_FD_FRAME], np.intp)
+        begins.append((kind, at))
+        at += size
+    raw, (kinds, starts) = np.frombuffer(content, np.uint8), np.array(begins, np.intp).reshape(-1, 2).T
+    places = [np.flatnonzero(kinds == kind) for kind in layouts]
+    classical, long = (
+        raw[starts[place, None] + np.arange(layout.itemsize)].view(layout)[:, 0]
+        for place, layout in zip(places, layouts.values(), strict=True)
+    )
+    return classical, long, np.concatenate(places)
 
 
 def _objects(
@@ -149,13 +146,13 @@ def _objects(
     return objects
 
 
-def container(objects: bytes) -> bytes:
+def container(objects: bytes, *, packed: bool = True) -> bytes:
     """A log container holding some objects."""
-    packed = zlib.compress(objects, 1)
-    size = OBJECT_HEAD.size + CONTAINER_HEAD.size + len(packed)
+    content = zlib.compress(objects, 1) if packed else objects
+    size = OBJECT_HEAD.size + CONTAINER_HEAD.size + len(content)
     head = OBJECT_HEAD.pack(b"LOBJ", OBJECT_HEAD.size, 1, size, CONTAINER)
     # Padding of size % 4 rather than to a multiple of 4 is what the format has.
-    return head + CONTAINER_HEAD.pack(2, len(objects)) + packed + bytes(size % 4)
+    return head + CONTAINER_HEAD.pack(2 if packed else 0, len(objects)) + content + bytes(size % 4)
 
 
 def containers(data: bytes, most: int) -> Iterator[tuple[bytes, str]]:
@@ -210,10 +207,3 @@ def sound_objects(content: bytes) -> bytes:
             return content[:at]
         at += size
     return content
-
-
-def repacked(head: bytes, content: bytes) -> bytes:
-    """A file with this file header and one uncompressed container."""
-    size = OBJECT_HEAD.size + CONTAINER_HEAD.size + len(content)
-    container_head = OBJECT_HEAD.pack(b"LOBJ", OBJECT_HEAD.size, 1, size, CONTAINER)
-    return head + container_head + CONTAINER_HEAD.pack(0, len(content)) + content + bytes(size % 4)

@@ -1,11 +1,8 @@
 """Every frame on the wire, to a file and back: what a run can be replayed from, bit for bit.
 
-Written is BLF, in small containers that are synced as they come: it keeps nanoseconds (text formats keep microseconds)
-and a killed file is readable up to its last flush. Read is whatever python-can reads: BLF, ASC, candump, TRC, ....
-
-A log is also a python-can bus of its own: what was recorded comes again, at the recorded pace or at full speed, for
-everything that takes such a bus (a ``can.Notifier``, ``canopen``). Nothing answers on it: no drive is there, and what
-is sent to it only reaches those who share the ``echo`` bus.
+Written is BLF, in small containers that are synced as they come: it keeps nanoseconds, and a killed file is readable up
+to its last flush. Read is whatever python-can reads. A log is also a python-can bus of its own (``LogBus``): nothing
+answers on it, and what is sent to it only reaches those who share the ``echo`` bus.
 """
 
 from __future__ import annotations
@@ -114,12 +111,9 @@ class BusLogWriter(GrowingLog):
 
 
 def read_frames(path: Path) -> Frames:
-    """All data frames of a bus log, whole or cut off.
+    """All data frames of a ``.blf``, ``.asc``, ``.log`` (candump), ``.trc`` or ``.db``, whole or cut off, also gzipped.
 
-    Read are ``.blf``, ``.asc``, ``.log`` (candump), ``.trc`` and ``.db``; also gzipped (``.asc.gz``).
-
-    Raises:
-        InputFileError: unreadable, of no known format, or without a single frame.
+    ``InputFileError``: unreadable, of no known format, or without a single frame.
     """
     try:
         if path.suffix.lower() == ".blf":
@@ -189,7 +183,7 @@ def _from_foreign_blf(path: Path, data: bytes, content: bytes, damage: str) -> F
     sound = blf.sound_objects(content)
     if len(sound) < len(content):
         damage = f"no object where one should be, at byte {len(sound)} of what the file holds unpacked"
-    whole = blf.repacked(data[: blf.FILE_HEADER.unpack_from(data)[1]], sound)
+    whole = data[: blf.FILE_HEADER.unpack_from(data)[1]] + blf.container(sound, packed=False)
     frames = _from_python_can(path, lambda: can.BLFReader(io.BytesIO(whole)))
     return replace(frames, damage=frames.damage or damage)
 

@@ -2,9 +2,8 @@
 
 Header ``time_s,position_rad,velocity_rad_s,torque_nm,position_command_rad``; time, position and one of torque and
 command must be there. A linear axis writes ``position_m,velocity_m_s,force_n,position_command_m``. Units are never
-guessed: a header in other words needs a column map. Separators (comma, semicolon, tab, bar), decimal commas, lines
-before the header, a row of units under it and text in Windows-1252 are found out and told. A file may have up to
-10,000,000 rows and 2 GB.
+guessed: a header in other words needs a column map. Separators, decimal commas, lines before the header, a row of units
+under it and text in Windows-1252 are found out and told.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan.linear_axis import linear_name
 from frictid_hil.recording.bounds import MAX_BYTES, MAX_ROWS, check_expansion, check_rows
 from frictid_hil.recording.draft import UNITS, without_unit
-from frictid_hil.recording.samples import Samples
+from frictid_hil.recording.samples import MAY_BE_MISSING, Samples
 from frictid_hil.recording.table import mapped, samples_of
 
 _MAX_HEADER = 65_536
@@ -54,10 +53,8 @@ _ORDER = (
 def read_csv(path: Path, columns: ColumnMap | None = None, joint: str | None = None) -> list[Samples]:
     """The recording in a CSV file (``.csv`` or ``.csv.gz``): one joint under the standard header, or what a map says.
 
-    ``joint`` is its name ("0" unless told); with a column map the only one wanted.
-
-    Raises:
-        InputFileError: unreadable, or a value that cannot be used, with line and column.
+    ``joint`` is its name ("0" unless told); with a column map the only one wanted. ``InputFileError`` for what is
+    unreadable, or a value that cannot be used, with line and column.
     """
     if columns is not None:
         return mapped(CsvTable, CsvTable(path), columns, joint)
@@ -68,7 +65,7 @@ def read_csv(path: Path, columns: ColumnMap | None = None, joint: str | None = N
     _check_header(table, names, present, path)
     time_s, *values = table.numbers(["time_s", *present])
     quantities = {names[name]: values[k] for k, name in enumerate(present)}
-    for optional in ("external_torque_nm", "temperature_c"):
+    for optional in MAY_BE_MISSING:
         if optional in quantities and np.isnan(quantities[optional]).all():
             del quantities[optional]
     meta = {"told": table.told} if table.told else {}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,7 +99,10 @@ def draft(table: Table, name: str) -> Draft:
     """A column map for a table; ``InputFileError`` with the columns there are where none is of a position."""
     guesses = [guess for column in table.names if (guess := guessed(column)) is not None]
     times = [guess for guess in guesses if guess.quantity == "time"]
-    of_joint = _by_joint(guess for guess in guesses if guess.quantity not in ("time", "temperature"))
+    of_joint: dict[str, dict[str, Guess]] = {}
+    for guess in guesses:
+        if guess.quantity not in ("time", "temperature"):
+            of_joint.setdefault(guess.joint, {}).setdefault(guess.quantity, guess)
     joints = {joint: columns for joint, columns in of_joint.items() if "position" in columns}
     whole = {joint: columns for joint, columns in joints.items() if {"torque", "position_command"} & set(columns)}
     joints = whole or joints
@@ -118,13 +121,6 @@ def draft(table: Table, name: str) -> Draft:
     left = tuple(column for column in table.names if column not in used)
     document = {"schema": "frictid.columns/1", "name": name, "time": time_document, "joints": documents}
     return Draft(document, tuple(findings), left)
-
-
-def _by_joint(guesses: Iterable[Guess]) -> dict[str, dict[str, Guess]]:
-    found: dict[str, dict[str, Guess]] = {}
-    for guess in guesses:
-        found.setdefault(guess.joint, {}).setdefault(guess.quantity, guess)
-    return found
 
 
 def _time(table: Table, times: list[Guess], findings: list[str]) -> tuple[Array, dict[str, object]]:

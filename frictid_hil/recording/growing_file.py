@@ -12,10 +12,8 @@ from frictid_hil.files import could_not_write
 class GrowingFile:
     """Appends pieces to a new file, each of them all or nothing; ``end`` tells the bytes written so far.
 
-    An existing file is replaced, a link is not followed.
-
-    Raises:
-        FrictidError: by every method, too: the disk refuses (no permission, disk full); what was written is kept.
+    An existing file is replaced, a link is not followed. Where the disk refuses, every method raises a
+    ``FrictidError``; what was written is kept.
     """
 
     def __init__(self, path: Path) -> None:
@@ -71,7 +69,7 @@ class GrowingLog:
         self._file = GrowingFile(path)
 
     def flush(self) -> None:
-        """Have what was taken on the disk; ``FrictidError`` where that is full: what was flushed is kept."""
+        """Write what was taken and sync it; ``FrictidError`` where the disk is full: what was flushed is kept."""
         self._write_taken()
         self._file.sync()
 

@@ -1,11 +1,8 @@
-"""MATLAB files: every numeric vector or matrix column is a column, every scalar a constant.
-
-Fields of a struct are named ``struct.field``. Version 7.3 is HDF5 inside and is read as such. Nothing is executed.
+"""MATLAB files: every numeric vector or matrix column is a column, every scalar a constant, ``struct.field`` a field.
 
 A file of version 5 (``save -v6`` and ``-v7``) is a header of 128 bytes and a row of elements, each with a tag of type
-and size; a matrix is an element made of elements: flags, dimensions, name, values. It is read, as far as numbers go,
-with every size checked against what is there, so that a spoilt file is an error and nothing else (scipy's reader,
-written for sound files, was seen to crash the interpreter on a spoilt one).
+and size; a matrix is an element made of elements: flags, dimensions, name, values. Every size is checked against what
+is there (scipy's reader was seen to crash the interpreter on a spoilt file). Version 7.3 is HDF5 inside.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Samples to an MCAP file that survives whatever kills the process.
 
-Rows are kept in memory until ``flush``, which writes them as one chunk and syncs it to the disk: what was flushed is
-readable after SIGKILL, and after a power failure up to the last whole record. ``close`` adds the summary by which tools
-seek; a file without it is read just as well, only slower.
+What ``flush`` has written as a chunk and synced is readable after SIGKILL, and after a power failure up to the last
+whole record. ``close`` adds the summary by which tools seek; without it a file is read just as well, only slower.
 """
 
 from __future__ import annotations
@@ -157,7 +156,9 @@ class SampleWriter(GrowingLog):
         for channel in map(int, np.unique(channels)):
             mine = channels == channel
             places[channel] = chunk_at + len(chunk) + len(index)
-            index += _message_index(channel, np.column_stack([times[mine], offsets[mine]]))
+            # The record by which tools find a channel's messages in a chunk: (log time, offset) pairs.
+            pairs = np.column_stack([times[mine], offsets[mine]]).astype("<u8").tobytes()
+            index += struct.pack("<BQHI", 0x07, 2 + 4 + len(pairs), channel, len(pairs)) + pairs
         self._file.write(chunk + index)
         self._index.append(
             mcap.ChunkIndex(
@@ -214,12 +215,6 @@ def write_samples(path: Path, recordings: Sequence[Samples]) -> None:
             writer.metadata(f"joint/{samples.joint}", samples.meta)
             for mark in samples.marks:
                 writer.mark(samples.joint, mark)
-
-
-def _message_index(channel: int, entries: NDArray[np.uint64]) -> bytes:
-    """The record by which tools find a channel's messages in a chunk: (log time, offset) pairs."""
-    pairs = entries.astype("<u8").tobytes()
-    return struct.pack("<BQHI", 0x07, 2 + 4 + len(pairs), channel, len(pairs)) + pairs
 
 
 def _bytes(*records: mcap.McapRecord) -> bytes:

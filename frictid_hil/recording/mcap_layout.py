@@ -1,7 +1,6 @@
 """What one sample looks like inside an MCAP file: a message of fixed size that tools open and numpy reads at a glance.
 
-The body is CDR as ROS 2 writes it, described by a ``ros2msg`` schema, so Foxglove and PlotJuggler show the columns by
-name. A fixed size makes a chunk an array of records::
+The body is CDR as ROS 2 writes it, with a ``ros2msg`` schema for Foxglove and PlotJuggler. A chunk is an array of::
 
     opcode u1 | length u8 | channel u2 | sequence u4 | log_time u8 | publish_time u8 | body
     body:  00 01 00 00 | sec i4 | nanosec u4 | eight float64 | status u4 | error_code u4
@@ -17,7 +16,7 @@ import numpy as np
 
 from frictid_hil.plan.linear_axis import linear_name
 
-VALUES = (
+VALUES = (  # columns of float64, in order
     "position_rad",
     "velocity_rad_s",
     "torque_nm",
@@ -27,7 +26,6 @@ VALUES = (
     "rigid_body_torque_nm",
     "temperature_c",
 )
-"""Columns of float64, in order."""
 
 COUNTS = ("status", "error_code")  # columns of uint32, in order
 

@@ -42,9 +42,8 @@ Rows = NDArray[np.void]
 def read_mcap(path: Path, joint: str | None = None) -> list[Samples]:
     """The recordings of all joints in a file, or of the only one wanted.
 
-    Raises:
-        InputFileError: not an MCAP file, none of this product's, without samples, without that joint, or with samples
-            that no reader should accept (see ``samples.checked``).
+    ``InputFileError``: no MCAP file of this product, without samples or that joint, or what ``samples.checked``
+    refuses.
     """
     contents = _Contents.of(path)
     rows = contents.rows_by_joint(path)

@@ -1,8 +1,7 @@
 """What physics says of a recording's units: velocity against position, torque against work, times and travel.
 
-A velocity that is 57.3 times the differenced position is in degrees; one that is a thousandth comes of milliseconds
-taken for seconds. A torque that drives what friction must brake has the wrong sign. A contradiction with a known factor
-is an error; what only looks odd is a doubt, which travels with the samples.
+A contradiction with a known factor (57.3: degrees) is an error; what only looks odd is a doubt, which travels with the
+samples.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.recording.samples import Samples
 
 _DEG, _RPM = 180 / math.pi, 30 / math.pi
-FACTORS: tuple[tuple[float, str], ...] = (
+FACTORS: tuple[tuple[float, str], ...] = (  # velocity over differenced position, and what it tells
     (_DEG, "the velocity is in degrees per second, or the position in turns of 360"),
     (1 / _DEG, "the position is in degrees"),
     (_RPM, "the velocity is in rpm"),
@@ -34,13 +33,12 @@ FACTORS: tuple[tuple[float, str], ...] = (
     (1e9, "the time is in nanoseconds"),
     (1e-3, "the time is said to be milliseconds and is in seconds (or the position is in mrad, mm)"),
 )
-"""Velocity over differenced position, and what it tells."""
 
 _BLOCK, _BLOCKS = 2000, 10
 
 
 def doubts_of(samples: Samples, *, where: str = "") -> tuple[str, ...]:
-    """What looks odd; ``InputFileError`` where a unit explains by what factor velocity and position differ."""
+    """What looks odd; ``InputFileError`` where velocity and position contradict each other by the factor of a unit."""
     parts = _parts(samples)
     return (*_of_velocity(samples, parts, where), *_of_motion(samples), *_of_torque(samples, parts))
 

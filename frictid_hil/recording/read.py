@@ -29,16 +29,14 @@ _TABLES: dict[tuple[str, ...], Callable[[Path], Table]] = {
 READABLE = tuple(suffix for suffixes in _TABLES for suffix in suffixes)  # how the names of recordings end
 
 
-def read(path: str | Path, columns: ColumnMap | None = None, joint: str | None = None) -> list[Samples]:
+def read(
+    path: str | Path,  # run folder, MCAP, CSV, .mat, npz, HDF5, parquet, ROS bag, LeRobot dataset, of BAM or PACE
+    columns: ColumnMap | None = None,  # which column is which, for files of other tools
+    joint: str | None = None,  # the only one wanted; the name of the joint where the file does not tell
+) -> list[Samples]:
     """The samples in a recording, one entry per joint.
 
-    Args:
-        path: run folder, MCAP, CSV, .mat, npz, HDF5, parquet, ROS bag, LeRobot dataset, recording of BAM or PACE.
-        columns: which column is which, for files of other tools.
-        joint: the only one wanted; the name of the joint where the file does not tell.
-
-    Raises:
-        InputFileError: unreadable, unusable, of an unknown kind, or without that joint.
+    ``InputFileError``: unreadable, unusable, of an unknown kind, or without that joint.
     """
     path = Path(path)
     if path.is_dir() and not array_files.is_lerobot(path) and not is_bag(path):

@@ -1,19 +1,21 @@
 """ROS bags: rosbag2 (MCAP and sqlite3) and ROS 1, by the package rosbags; no ROS is needed.
 
-Read are messages that hold lists of numbers beside a list of joint names: ``sensor_msgs/JointState``,
-``control_msgs/JointTrajectoryControllerState`` and their like. Joints are found by name in every message, whatever
-their order; times are those of ``header.stamp``, or of the log where that is zero.
+Read are messages that hold lists of numbers beside a list of joint names (``sensor_msgs/JointState`` and the like), by
+name, whatever their order; times are those of ``header.stamp``, or of the log where that is zero.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 from frictid_hil.columns import JOINT, ColumnMap, JointColumns, Source
@@ -24,13 +26,12 @@ from frictid_hil.recording.bounds import check_expansion, check_rows
 
 _NAMES = ("name", "joint_names")
 _MAX_FORMS = 200  # messages of one topic may differ in this many ways (order of names, lengths of lists)
-_MEANING = {
+_MEANING = {  # where each quantity stands, best first; rad, rad/s and N m by the convention of ROS
     "position_rad": ("position", "feedback.positions", "actual.positions"),
     "velocity_rad_s": ("velocity", "feedback.velocities", "actual.velocities"),
     "torque_nm": ("effort", "feedback.effort", "actual.effort", "output.effort"),
     "position_command_rad": ("reference.positions", "desired.positions"),
 }
-"""Where each quantity stands, best first; rad, rad/s and N m by the convention of ROS."""
 
 
 def is_bag(path: Path) -> bool:
@@ -266,13 +267,9 @@ def _check_chunks(path: Path) -> None:
 def _frame_size(chunk: bytes, name_length: int) -> int:
     """What the compressed frame at the start of a chunk says it unpacks to; 0 where it does not say."""
     name, data = chunk[32 : 32 + name_length], chunk[32 + name_length + 8 :]
-    if name == b"zstd":
-        if len(data) < 14 or data[:4] != b"\x28\xb5\x2f\xfd":
-            return 0
-        single, kind = bool(data[4] & 0x20), data[4] >> 6
-        at = 5 + (not single) + (0, 1, 2, 4)[data[4] & 3]
-        width = {0: 1 if single else 0, 1: 2, 2: 4, 3: 8}[kind]
-        return int.from_bytes(data[at : at + width], "little")
-    if name == b"lz4" and len(data) >= 14 and data[:4] == b"\x04\x22\x4d\x18" and data[4] & 0x08:
-        return int.from_bytes(data[6:14], "little")
+    with suppress(zstandard.ZstdError, RuntimeError):
+        if name == b"zstd":
+            return max(0, int(zstandard.frame_content_size(data)))
+        if name == b"lz4":
+            return int(lz4.frame.get_frame_info(data)["content_size"])
     return 0

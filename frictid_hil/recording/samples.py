@@ -17,6 +17,7 @@ from frictid_hil.errors import InputFileError
 from frictid_hil.friction.trajectory import Array
 
 Nanoseconds = NDArray[np.int64]
+MAY_BE_MISSING = ("external_torque_nm", "temperature_c")
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +94,7 @@ class Samples:
 def checked(samples: Samples, *, where: str = "") -> Samples:
     """The same samples, after the checks every reader owes its user.
 
-    Raises:
-        InputFileError: no rows, unequal lengths, time not strictly increasing, or a value that is not finite; the
-            message names the column and the row.
+    ``InputFileError`` with column and row: no rows, unequal lengths, time not strictly increasing, a value not finite.
     """
     n = len(samples)
     if n < 2:
@@ -112,7 +111,7 @@ def checked(samples: Samples, *, where: str = "") -> Samples:
         if column.shape != (n,):
             raise InputFileError(f"column {name} has {column.size} values for {n} times", where=where)
         bad = np.flatnonzero(~np.isfinite(column))
-        if bad.size and name not in ("external_torque_nm", "temperature_c"):
+        if bad.size and name not in MAY_BE_MISSING:
             raise InputFileError(
                 f"column {name} has {bad.size} values that are not finite, the first at row {int(bad[0])}",
                 where=where,

@@ -18,11 +18,9 @@ from frictid_hil.errors import InputFileError
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan.linear_axis import linear_name
 from frictid_hil.recording.proofs import doubts_of
-from frictid_hil.recording.samples import Nanoseconds, Samples, checked
+from frictid_hil.recording.samples import MAY_BE_MISSING, Nanoseconds, Samples, checked
 
 _EPOCH_NS = 1e17  # times beyond this (three years) are of a wall clock; run time is what has passed since the first row
-
-_MAY_BE_MISSING = ("external_torque_nm", "temperature_c")
 
 
 class Table(Protocol):
@@ -147,7 +145,7 @@ def samples_of(
     """
     for name, column in {"time": time, **columns}.items():
         bad = np.flatnonzero(~np.isfinite(column))
-        if bad.size and name not in _MAY_BE_MISSING:
+        if bad.size and name not in MAY_BE_MISSING:
             shown = linear_name(name) if prismatic else name
             raise InputFileError(
                 f"{table.place(int(bad[0]))}: {shown} is {column[bad[0]]} ({bad.size} such rows)",
