@@ -1,8 +1,7 @@
 """Several joints with their drives on one arm: what one link accelerates, the others feel.
 
-Every joint keeps its own servo loop, gear, friction, encoder and effects; the inertia of its link and its gravity come
-from the arm instead. Once per control period the rigid bodies are evaluated, at the middle of the period to come; all
-joints then move through its sub-steps together (``plant.run_coupled``). A payload or a hand acts on its own joint.
+Each keeps its own loop, gear, friction, encoder and effects. Once per control period the rigid bodies are evaluated, at
+the middle of the period to come; all joints then move through its sub-steps together (``plant.run_coupled``).
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """An arm as a value: what a robot file's ``simulated_arm`` mapping says of the links, checked.
 
-Each link has mass, centre of mass and inertia; where the joints are, their Denavit-Hartenberg rows say. The frame of a
-link has its origin and z axis on the joint that carries it and turns with it; x is that of the row's angle.
+The frame of a link has its origin and z axis on the joint that carries it and turns with it; x is that of the row.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """From the bare joint and the effects that exist, one compiled kernel.
 
-``plant.py`` is read as text, its marked lines are replaced by calls of the effects' hooks, and the result is written as
-a module of its own, named by a hash of everything in it, into the user's cache folder. So numba's on-disk cache
-works (it needs a file), and never serves a kernel built from an older effect.
+``plant.py`` is read as text, its marked lines are replaced by calls of hooks, and the result is written as a module
+named by its hash into the user's cache folder: numba's on-disk cache needs a file, and never serves an older effect's
+kernel.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """What the inverse form of an effect of drive or encoder is: how it shows between demand, motion and their reports.
 
-Such an effect is no torque of the joint's balance. It stands between the controller's demand and the reported torque
-(``ActuationForm``), or in the reported position and velocity themselves (``KinematicForm``), or both; where nothing but
-command and position is recorded, effects form a chain from one to the other (``TrackingForm``). The diagnosis composes
-whatever forms there are and knows none of them by name.
+Such an effect stands between the controller's demand and the reported torque (``ActuationForm``), in the reported
+position and velocity themselves (``KinematicForm``), or both; where nothing but command and position is recorded,
+effects form a chain from one to the other (``TrackingForm``). The diagnosis knows none of them by name.
 """
 
 from __future__ import annotations

@@ -29,12 +29,9 @@ from frictid_hil.simulation.inverse import InverseForm
 class Channel(Enum):
     """Which residual of a recording an effect can show in."""
 
-    KINEMATIC = "K"
-    """Reported velocity against differenced position, the position steps themselves."""
-    ACTUATION = "A"
-    """Reported torque against the controller's demand."""
-    PLANT = "P"
-    """Reported torque against the joint's equation of motion."""
+    KINEMATIC = "K"  # reported velocity against differenced position, the position steps themselves
+    ACTUATION = "A"  # reported torque against the controller's demand
+    PLANT = "P"  # reported torque against the joint's equation of motion
 
 
 class Region(Enum):

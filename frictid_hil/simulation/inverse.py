@@ -1,8 +1,7 @@
 """What the inverse form of an effect is: a recording turned into regressors of the joint's torque balance.
 
-The diagnosis explains ``measured torque - nominal model`` by columns. A form has a grid of *shapes* (the parameters
-that enter nonlinearly, e.g. a Stribeck velocity); for each shape it gives a few columns whose coefficients enter
-linearly, and knows how to read the effect's own parameters from shape and coefficients.
+The diagnosis explains ``measured torque - nominal model`` by columns: for each *shape* of a grid (the parameters that
+enter nonlinearly) a few, whose coefficients enter linearly, and from both of them the effect's own parameters.
 """
 
 from __future__ import annotations

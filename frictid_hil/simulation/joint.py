@@ -1,7 +1,7 @@
 """One geared joint as a value: what a robot file's ``simulated`` mapping says, checked.
 
-The torque that moves it obeys torque = inertia * acceleration + gravity + friction, all on the joint side of the gear;
-friction is a rate curve behind an elasto-plastic presliding spring, and everything beyond that is an effect by name.
+torque = inertia * acceleration + gravity + friction, on the joint side of the gear; friction is a rate curve behind an
+elasto-plastic presliding spring, and everything beyond that is an effect by name.
 """
 
 from __future__ import annotations
@@ -131,17 +131,15 @@ class JointModel:
     def from_mapping(
         mapping: Mapping[str, Any], *, gear_ratio: float, rated_torque_nm: float, max_torque_nm: float
     ) -> JointModel:
-        """The joint that a robot file's ``simulated`` mapping describes.
+        """The joint of a robot file's ``simulated`` mapping, whose ``servo`` may lower the drive's torque limit.
 
-        ``max_torque_nm`` is the drive's torque limit unless ``servo`` lowers it.
-
-        Raises:
-            InvalidFields: every unknown key or effect, missing or out-of-range value, with its path.
+        Every unknown key or effect, missing or out-of-range value is told by an ``InvalidFields``, with its path.
         """
         top = Fields(mapping)
         inertia = top.number("inertia_kg_m2", low=1e-6, high=1e6)
         friction = _read_friction(top.part("friction"), required="friction" in top, top=top)
         level = friction.coulomb_nm
+        encoder = top.part("encoder")
         drive, gains = Drive(rated_torque_nm, math.inf), ServoGains.for_inertia(inertia)
         model = JointModel(
             inertia_kg_m2=inertia,
@@ -153,7 +151,7 @@ class JointModel:
             presliding_stiffness_nm_per_rad=top.number(
                 "presliding_stiffness_nm_per_rad", max(level, 1e-3) / PRESLIDING_TRAVEL_RAD, low=1e-3, high=1e9
             ),
-            encoder=_read_encoder(top.part("encoder")),
+            encoder=Encoder(encoder.choice("side", "motor", ("motor", "link")), **_numbers(encoder, _ENCODER, _COUNTS)),
             drive=replace(drive, **_numbers(top.part("drive"), _DRIVE, asdict(drive))),
             servo=gains,
             payload=Payload(**_numbers(top.part("payload"), _PAYLOAD)) if "payload" in top else None,
@@ -170,7 +168,7 @@ class JointModel:
 
     @staticmethod
     def of(joint: Simulated, name: str) -> JointModel:
-        """Of a robot file, or as a driver knows it; ``InvalidFields`` by ``joints.NAME.simulated.KEY``."""
+        """The simulated joint of a robot file or driver; ``InvalidFields`` by ``joints.NAME.simulated.KEY``."""
         try:
             return JointModel.from_mapping(
                 joint.simulated,
@@ -203,7 +201,7 @@ class JointModel:
         return mapping
 
     def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> JointModel:
-        """The same with these effects alone; ``InvalidFields`` for what is unknown or out of bounds."""
+        """The same joint with these effects alone; ``InvalidFields`` for what is unknown or out of bounds."""
         fields = Fields(effects, ("effects",))
         complete = _read_effects(fields)
         fields.finish()
@@ -229,6 +227,7 @@ def _read_friction(fields: Fields, *, required: bool, top: Fields) -> FrictionCu
 _Bounds = Mapping[str, tuple[float, float]]
 _FRICTION: _Bounds = {"coulomb_nm": (0.0, 1e6), "viscous_nm_s_per_rad": (0.0, 1e6)}
 _ENCODER: _Bounds = {"counts_per_revolution": (0.0, 1e12)}
+_COUNTS = asdict(Encoder())
 _DRIVE: _Bounds = {
     "torque_quantum_per_mille": (0.0, 1000.0),
     "torque_noise_per_mille": (0.0, 1000.0),
@@ -245,11 +244,6 @@ def _numbers(fields: Fields, bounds: _Bounds, defaults: Mapping[str, Any] | None
     told = {n: fields.number(n, (defaults or {}).get(n), low=low, high=high) for n, (low, high) in bounds.items()}
     fields.no_others()
     return told
-
-
-def _read_encoder(fields: Fields) -> Encoder:
-    side = fields.choice("side", "motor", ("motor", "link"))
-    return Encoder(side, **_numbers(fields, _ENCODER, asdict(Encoder())))
 
 
 def _read_effects(fields: Fields) -> dict[str, dict[str, float]]:

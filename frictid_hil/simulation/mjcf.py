@@ -1,9 +1,8 @@
 """A joint for MuJoCo: what MJCF can say as joint parameters, the rest as a callback, and what neither can say.
 
-``described`` writes the model. Inertia, armature, gravity, compliance, play, the torque limit and the torque constant
-are joint and actuator parameters, with every effect on them included. Friction is a spring that yields and a damping of
-three numbers (MuJoCo 4), see ``native``. ``MujocoJoint`` installs the callback that puts the
-joint's own friction, drive and sensors in their place, by the very formulas of the simulation.
+In the model of ``described``, inertia, armature, gravity, compliance, play, torque limit and torque constant are exact,
+friction is as near as ``native`` comes. ``MujocoJoint`` installs the callback that puts the joint's own friction, drive
+and sensors in their place, by the very formulas of the simulation.
 """
 
 from __future__ import annotations
@@ -25,12 +24,9 @@ from frictid_hil.simulation.robot_model import ModelJoint
 STEP_S = 1e-4  # time step of the model; the slip spring asks for it
 GRAVITY_M_S2 = 9.81
 
-_IN_MJCF = {"inertia", "gravity", "coupling", "coupling_damping", "play"}
-"""Stages of the simulation whose effects are joint parameters."""
-_SENSED = {"encoder", "resolution", "report_velocity", "temperature"}
-"""Stages that change what is reported, not what moves."""
-_CONTROLLER = {"proportional_gain", "integral_gain", "derivative_gain"}
-"""Stages of the position loop, which is no part of the exported joint."""
+_IN_MJCF = {"inertia", "gravity", "coupling", "coupling_damping", "play"}  # stages that are joint parameters
+_SENSED = {"encoder", "resolution", "report_velocity", "temperature"}  # stages of the report
+_CONTROLLER = {"proportional_gain", "integral_gain", "derivative_gain"}  # stages of the loop, no part of the joint
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,7 @@
 """The user's model file with native elements put in: what to write, and whether anything else has changed.
 
-An MJCF gets attributes and elements by ``native_elements``; a URDF gets the two numbers of friction and the effort
-limit that it can hold. The edited file is compiled before it is given back, and compared with the original: names,
-bodies, and every number of other joints must be the same.
+A URDF gets the two numbers of friction and the effort limit that it can hold. What was edited is compiled and compared
+with the original: names, bodies, and every number of other joints must be the same.
 """
 
 from __future__ import annotations

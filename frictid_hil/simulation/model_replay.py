@@ -74,7 +74,9 @@ def replayed(
     stepper: Stepper = _InMujoco(m, data, frozen)
     for row, wanted in enumerate(command_rad):
         if engine is not None and row == begin:
-            stepper = engine(_holding(m, frozen), data)
+            held_still = copy.copy(m)
+            held_still.dof_armature[frozen] = HELD_KG_M2  # joints that stand, by an inertia that nothing moves
+            stepper = engine(held_still, data)
         positions[row], torques[row] = stepper.position()[places], mean
         if row == len(steps):
             break
@@ -113,10 +115,3 @@ class _InMujoco:
 
     def position(self) -> Array:
         return np.asarray(self._data.qpos)
-
-
-def _holding(model: Any, frozen: list[int]) -> Any:
-    """The model with joints that stand, by an inertia that nothing moves."""
-    held = copy.copy(model)
-    held.dof_armature[frozen] = HELD_KG_M2
-    return held

@@ -1,8 +1,4 @@
-"""A model file as its user wrote it, edited in place: what is not changed stays byte for byte.
-
-Names, comments, includes, order and white space are the user's. ``ModelText`` reads the file with what it includes,
-finds an element, and changes attributes of its start tag or adds text before its end.
-"""
+"""A model file as its user wrote it, includes too, edited in place: what is not changed stays byte for byte."""
 
 from __future__ import annotations
 
@@ -15,6 +11,7 @@ from xml.parsers import expat
 
 from frictid_hil.errors import InputFileError
 
+_START_TAG = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""")  # a ``>`` within quotes is no end
 _NOT_JOINTS = ("equality", "fixed", "default", "sensor", "actuator")
 
 
@@ -71,7 +68,9 @@ def _parse(file: XmlFile) -> None:
 
     def started(tag: str, attributes: dict[str, str]) -> None:
         start = parser.CurrentByteIndex
-        inside = _end_of_tag(file.content, start)
+        match = _START_TAG.match(file.content, start)
+        assert match is not None  # expat has read it
+        inside = match.end()
         empty = file.content[inside - 2 : inside] == b"/>"
         parent = open_ones[-1] if open_ones else None
         element = Element(tag, dict(attributes), start, inside, inside, empty, parent, file)
@@ -86,13 +85,6 @@ def _parse(file: XmlFile) -> None:
     parser.StartElementHandler = started
     parser.EndElementHandler = ended
     parser.Parse(file.content, True)
-
-
-def _end_of_tag(content: bytes, start: int) -> int:
-    """First byte after the start tag at ``start``; a ``>`` within quotes is none."""
-    match = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""").match(content, start)
-    assert match is not None  # expat has read it
-    return match.end()
 
 
 class ModelText:

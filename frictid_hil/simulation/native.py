@@ -29,18 +29,16 @@ from frictid_hil.simulation.steady import steady_friction_nm
 
 FORMS = ("spring", "lugre", "ramps", "loss")
 
-FRICTION = {
+FRICTION = {  # effects that are a part of sliding friction
     "stribeck", "viscous_nonlinearity", "direction_asymmetry", "load_dependent_friction", "directional_efficiency",
     "presliding_hysteresis", "stiction_breakaway", "friction_level_error", "viscous_error", "temperature_drift",
 }  # fmt: skip
-"""Effects that are a part of sliding friction."""
 _STEEP = 1.2  # the damping polynomial may not fall up to this multiple of the fastest speed
 _STIFFEST = 0.4  # stiffness times squared step over inertia, at most: what an explicit spring bears without ringing
 _STEP_RULE = 1.3  # sigma1 over the least that LuGre needs at the model's step
 _SMALLEST_RISE = 1e-3  # rise at standstill over the level, below which it is rounding
 _RISE_BASE = 0.05  # level that LuGre needs at speed, over its rise; taken off the spring
-_KNEES = (0.12, 0.4, 0.9, 1.8, 3.4)
-"""Speeds at which the ramps of a falling curve end, over that of the curve: a fall of an exponential to 1 %."""
+_KNEES = (0.12, 0.4, 0.9, 1.8, 3.4)  # ends of the ramps over the curve's speed: an exponential's fall to 1 %
 _HOLDS = 1.2  # damping of what holds the ramps at rest over theirs
 _HOLDS_NM = 2e-3  # its level over that of the joint
 _LOOP_ENDS = 20.0  # travel over that of a presliding loop, after which it is turned over

@@ -1,7 +1,6 @@
 """How near a native export comes to our own simulation: both driven along the same command, torque against torque.
 
-The user's compiled model moves one joint; the others are held where they stand by an inertia that nothing moves. Our
-own simulation gets the inertia and the gravity that the joint has in that posture.
+The user's compiled model moves one joint; the others are held. Ours has the inertia and gravity of that posture.
 """
 
 from __future__ import annotations

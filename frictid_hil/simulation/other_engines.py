@@ -1,7 +1,6 @@
 """Other engines that read MuJoCo's models or a USD stage, where they are installed; all on the processor.
 
-``installed`` says which of mujoco-warp and MJX can step a compiled model here. Newton reads the stage that is written
-for it. The first use of an engine compiles it, which takes a minute or two; after that it is kept.
+The first use of an engine compiles it, which takes a minute or two; after that it is kept.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """A whole recording simulated again: the same commands, the same controller, a modelled joint.
 
-Rows follow one timing rule: position k is sampled at t_k; torque k is the mean of what was applied since t_(k-1);
-command k acts from t_k.
+Position k is sampled at t_k; torque k is the mean of what was applied since t_(k-1); command k acts from t_k.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import JointModel
 
 SUBSTEP_S = 1e-4  # longest sub-step of the physics
+CarryOver = Mapping[str, tuple[float, ...]]  # what the joint remembers of a recording (its warmth), by effect
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +43,6 @@ class Controller:
     added_nm: Callable[[Array, float], Array] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class CarryOver:
-    """What the joint remembers from one recording to the next (its warmth), by effect."""
-
-    memory: Mapping[str, tuple[float, ...]]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulated:
     """The rows of a simulated recording; every array has the shape of its time."""
@@ -69,8 +62,6 @@ def closed_loop(
     payload: bool = False,  # it is mounted
     seed: int | None = None,  # of the noise on the reported torque, then rounded as the drive does; None for neither
     state: CarryOver | None = None,  # warmth left by the recording before; None for a cold joint
-    start_rad: float | None = None,  # where the joint rests at the first row; None for its first command
-    substep_s: float = SUBSTEP_S,  # longest sub-step of the physics; longer ones are for searches that only compare
 ) -> Simulated:
     """The joint under a controller that follows the recorded commands."""
     time = np.asarray(time_s, dtype=np.float64)
@@ -98,8 +89,7 @@ def closed_loop(
     parameters[plant.KD] = controller.kd_nm_s_per_rad
     parameters[plant.CONTROL_FILTER_S] = controller.velocity_filter_s
     parameters[plant.TORQUE_LIMIT] = min(controller.torque_limit_nm, model.drive.torque_limit_nm)
-    start = float(command[0]) if start_rad is None else start_rad
-    rows = _simulate(parameters, commands, period_s, plant.POSITION_MODE, start, state, time, substep_s)
+    rows = _simulate(parameters, commands, period_s, plant.POSITION_MODE, float(command[0]), state, time)
     return rows if seed is None else _noisy(rows, model, seed)
 
 
@@ -135,7 +125,6 @@ def _simulate(
     start_rad: float,
     carried: CarryOver | None,
     time: Array,
-    substep_s: float = SUBSTEP_S,
 ) -> Simulated:
     vector = packing.state()
     functions = kernel()
@@ -143,10 +132,10 @@ def _simulate(
     states = layout().states
     slots = {e.name: slice(states[e.name], states[e.name] + e.state_size) for e in all_effects().values() if e.carried}
     for name, slot in slots.items():
-        if carried is not None and name in carried.memory:
-            vector[slot] = carried.memory[name]
+        if carried is not None and name in carried:
+            vector[slot] = carried[name]
     first_rad = vector[plant.MEASURED]
-    substeps = max(1, math.ceil(period_s / substep_s - 1e-6))
+    substeps = max(1, math.ceil(period_s / SUBSTEP_S - 1e-6))
     readings = np.empty((len(commands), plant.READINGS))
     functions.run(parameters, vector, commands, readings, mode, substeps, period_s / substeps)
 
@@ -157,7 +146,7 @@ def _simulate(
     integral = np.interp(time, ticks, np.concatenate([[0.0], np.cumsum(readings[:, plant.READ_TORQUE]) * period_s]))
     torque = np.concatenate([[holding_nm], np.diff(integral) / np.diff(time)])
     memory = {name: tuple(vector[slot].tolist()) for name, slot in slots.items()}
-    return Simulated(position, velocity, torque, CarryOver(memory))
+    return Simulated(position, velocity, torque, memory)
 
 
 def _noisy(rows: Simulated, model: JointModel, seed: int) -> Simulated:

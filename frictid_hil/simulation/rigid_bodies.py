@@ -1,7 +1,6 @@
 """Rigid-body dynamics of an arm, by MuJoCo: inertia matrix, and what gravity and velocities ask of each joint.
 
-The library computes, this module only describes the chain to it. Motors, gears and friction are no part of it: they are
-the joints', see ``joint``.
+Motors, gears and friction are no part of it: they are the joints', see ``joint``.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """A robot as its user's own simulator has it: MJCF or URDF, read by MuJoCo itself.
 
-``RobotModel.load`` reads the file. It tells what the file believes of each joint (``joint``), and what the rigid bodies
-ask of every joint along a motion of all of them (``rigid_body_torque``). Friction, damping and motors are no part of
-that torque: they are what a diagnosis is about.
+It tells what the file believes of each joint, and what the rigid bodies ask of every joint along a motion of all of
+them. Friction, damping and motors are no part of that torque: they are what a diagnosis is about.
 """
 
 from __future__ import annotations
@@ -85,11 +84,9 @@ class RobotModel:
 
     @staticmethod
     def load(path: Path) -> RobotModel:
-        """Read and compile a file.
+        """Read and compile a file; raises as ``mujoco_library``.
 
-        Raises:
-            ConfigError: the package mujoco is missing.
-            InputFileError: MuJoCo cannot read it, or no joint of it has a name.
+        ``InputFileError``: MuJoCo cannot read it, or no joint of it has a name.
         """
         library = mujoco_library()
         urdf = is_urdf(path)

@@ -1,7 +1,6 @@
-"""A simulated drive around one simulated joint: its position, velocity and torque loops, its brake and its sensors.
+"""A simulated drive around one simulated joint, in joint-side numbers: its loops, its brake and its sensors, no bus.
 
-It knows nothing of buses or object dictionaries: joint-side numbers in, joint-side numbers out. A reading is latched at
-the end of every ``advance``; the torque is the mean of what was applied during it.
+A reading is latched at the end of every ``advance``; the torque is the mean of what was applied during it.
 """
 
 from __future__ import annotations
@@ -15,8 +14,7 @@ from frictid_hil.errors import UsageError
 from frictid_hil.simulation import packing, plant
 from frictid_hil.simulation.compose import kernel
 from frictid_hil.simulation.joint import HandImpedance, JointModel
-
-SUBSTEP_S = 1e-4  # longest sub-step of the physics
+from frictid_hil.simulation.replay import SUBSTEP_S
 
 _NOISE_BLOCK = 4096
 

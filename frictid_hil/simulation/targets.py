@@ -1,7 +1,4 @@
-"""Improved joints for other simulators: Isaac Lab, mjlab, BAM, ros2_control, a C header. What is lost is told.
-
-Every target gets the same few numbers of a joint (``Numbers``), made of our simulated joint with its causes.
-"""
+"""Improved joints for other simulators: Isaac Lab, mjlab, BAM, ros2_control, a C header. What is lost is told."""
 
 from __future__ import annotations
 

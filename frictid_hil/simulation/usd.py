@@ -1,7 +1,7 @@
 """Improved joints for Newton, as USD text: a stage of their own, or an overlay on the stage that its user has.
 
-USD counts angles in degrees; masses are kg, lengths m. Newton's importer reads ``newton:armature``, ``newton:friction``
-and ``newton:damping`` of a joint and its position drive; its MuJoCo solver reads how stiff friction is, too.
+USD counts angles in degrees. Newton's importer reads ``newton:armature``, ``newton:friction`` and ``newton:damping`` of
+a joint and its position drive; its MuJoCo solver reads how stiff friction is, too.
 """
 
 from __future__ import annotations
@@ -42,12 +42,10 @@ def overlay(stage: Path, prims: Mapping[str, tuple[str, bool]], joints: Mapping[
 
 
 def joint_prims(stage: Path, joints: Sequence[str]) -> dict[str, tuple[str, bool]]:
-    """(path, slides) of the joints of a stage by name; the package usd-core reads it.
+    """(path, slides) of the joints of a stage by name.
 
-    Raises:
-        ConfigError: usd-core is missing.
-        InputFileError: the stage cannot be read.
-        UsageError: it has no joint of a name, or more than one.
+    ``ConfigError``: usd-core, which reads it, is missing. ``InputFileError``: the stage cannot be read. ``UsageError``:
+    it has no joint of a name, or more than one.
     """
     try:
         from pxr import Tf, Usd

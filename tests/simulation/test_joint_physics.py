@@ -323,7 +323,7 @@ def test_warmth_lowers_friction_and_carries_over_to_the_next_recording() -> None
     model = bare(effects={"temperature_drift": warm})
     time, command = excitation()
     first = closed_loop(model, CONTROLLER, time, command)
-    heat = first.state.memory["temperature_drift"][0]
+    heat = first.state["temperature_drift"][0]
     assert 0.1 < heat < 3.0
     second = closed_loop(model, CONTROLLER, time, command, state=first.state)
     cold = closed_loop(model, CONTROLLER, time, command)

@@ -1,7 +1,6 @@
 """All effects there are: every module of this folder that has an ``EFFECT``, and those that users add.
 
-Adding an effect to the product is adding its file. A user's own comes from an installed package: an entry point of the
-group ``frictid_hil.effects``, named like the effect, that leads to it.
+A user's own is an entry point of the group ``frictid_hil.effects``, named like the effect, that leads to it.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ GROUP = "frictid_hil.effects"  # entry points of users' own effects
 
 @functools.cache
 def all_effects() -> dict[str, Effect]:
-    """By name, alphabetically; ``UsageError`` for one that cannot be loaded, is none, or has a taken name."""
+    """Every effect by name, sorted; ``UsageError`` for one that cannot be loaded, is none, or has a taken name."""
     effects: dict[str, Effect] = {}
     for module in sorted(pkgutil.iter_modules(__path__), key=lambda found: found.name):
         effect: Effect = importlib.import_module(f"{__name__}.{module.name}").EFFECT

@@ -72,8 +72,7 @@ def _shape(link_kg_m2: float, gap_rad: float, frequency_hz: float, ratio: float)
     }
 
 
-CONTACTS = ((35.0, 0.08), (70.0, 0.08), (30.0, 0.4), (70.0, 0.4))
-"""Frequency in Hz at which the link rings in the closed contact, and damping over the critical one."""
+CONTACTS = ((35.0, 0.08), (70.0, 0.08), (30.0, 0.4), (70.0, 0.4))  # Hz of the link, damping over the critical one
 CLOSER = (0.75, 0.85, 1.15, 1.3)  # gaps that are tried beside the one that describes most
 
 

@@ -13,8 +13,7 @@ def encoder(measured_rad: float, offset_rad: float) -> float:
     return measured_rad + offset_rad
 
 
-LARGEST_RAD = 0.2
-"""Offset up to which gravity's slope tells it to 2 %; beyond, the joint hangs otherwise than the model has it."""
+LARGEST_RAD = 0.2  # up to which gravity's slope tells it to 2 %; beyond, the joint hangs otherwise than modelled
 
 
 EFFECT = Effect(

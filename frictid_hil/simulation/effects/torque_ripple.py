@@ -15,10 +15,9 @@ PREFIXES = ("", "second_", "third_", "fourth_")
 MOST_CYCLES = 600  # highest line looked for; 300 slots times two is more than motors have
 MOST_ROWS = 12_000  # rows that lines are looked for in; more tell no more
 NEIGHBOURS = 8  # lines on either side that make a line's floor
-USUAL: tuple[Shape, ...] = tuple({"first": k} for k in (1.0, 2.0, 4.0)) + tuple(
+USUAL: tuple[Shape, ...] = tuple({"first": k} for k in (1.0, 2.0, 4.0)) + tuple(  # lines of a wave generator
     {"first": a, "second": b} for a, b in ((1.0, 2.0), (2.0, 4.0), (1.0, 4.0))
 )
-"""Lines of a wave generator."""
 STANDS_OUT = 25.0
 """Power over floor of a line worth trying: noise alone passes it at one line in 1e7 (an exponential law's median is
 0.69 of its mean); what passes is judged like every other shape."""
