@@ -1,8 +1,7 @@
-"""The control law of a compensated joint as plain values: gravity, a low-gain PD and friction compensation.
+"""The control law of a compensated joint as plain values: gravity, a low-gain PD and friction compensation (section 5).
 
-``ControlLaw`` holds section 5 of the paper. Two motions of a plan need it: ``Probe`` asks whether the profile still
-describes the joint, and ``Compensated`` runs the law. Both can be printed and sent to another process like the rest of
-the plan. ``runner.compensation`` turns a law into torque, cycle by cycle.
+``Probe`` asks whether the profile still describes the joint, and ``Compensated`` runs the law: motions of a plan, to be
+printed and sent to another process like the rest of it. ``runner.compensation`` turns a law into torque.
 """
 
 from __future__ import annotations

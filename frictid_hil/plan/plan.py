@@ -1,8 +1,7 @@
 """The plan says what will move, where to, how fast and for how long. It is frozen before anything moves.
 
-A plan is a list of joints, each with its motions in order. A motion knows its set-points as a function of its own time,
-so that the same object is checked against limits, printed for the person who says yes, streamed to the drive, and read
-back by the identification.
+A motion knows its set-points as a function of its own time: it is checked against limits, printed for the person who
+says yes, streamed to the drive, and read back by the identification.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""The box that an arm may not leave. Every joint of the chain is checked, and the tool.
+"""The box that an arm may not leave, checked at every joint of the chain, and the tool.
 
-A link is taken as the line from joint to joint. The box is convex, so that a line is inside if both of its ends are.
-The thickness of the links has to be part of the clearance of the box.
+A link is the line from joint to joint, inside a convex box if its ends are; its thickness is part of the clearance.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """An index beside files that are written once: what was read of each, kept in SQLite, so that it is read only once.
 
-The files are the truth. An index that is lost, spoilt, of another version, or in a place where it cannot be written is
-made anew from them, and costs nothing but time; so does a process killed between a file and its row.
+The files are the truth: an index that is lost, spoilt, of another version, or in a place where it cannot be written
+costs nothing but time; so does a process killed between a file and its row.
 
-SQLite keeps its rollback journal, the default, and no write-ahead log: that one needs memory shared by all readers,
-which network file systems do not give. Nor does anything depend on SQLite's locks, which such systems may lack: every
-row follows from one file that never changes, whoever writes it.
+SQLite keeps its rollback journal and no write-ahead log: that one needs memory shared by all readers, which network
+file systems do not give. Nor does anything depend on its locks: every row follows from one file that never changes.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class Index:
         self._told = told
 
     def values(self, kind: str, names: Sequence[str], read: Callable[[str], Any]) -> dict[str, Any]:
-        """Of every name, in their order; what is not kept is read, and kept. Raises as ``read`` does."""
+        """The value of every name, in their order; what is not kept is read, and kept. Raises as ``read`` does."""
         if not names:
             return {}
         try:

@@ -15,8 +15,7 @@ from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import FrictionProfile, JointProfile
 from frictid_hil.profiles.drift import JointDrift, drift
 
-_SAME = 0.5
-"""A joint has drifted only if the intervals of at least this share of its pairs no longer meet the reference's."""
+_SAME = 0.5  # a joint has drifted only if the intervals of this share of its pairs no longer meet the reference's
 
 _NEVER_SILENTLY = ("drive serial", "gear_ratio", "rated_torque_nm", "torque_source", "method")
 """What makes two curves incomparable; a person must say that the new one is meant."""

@@ -8,9 +8,9 @@
         recalibrations/<UTC>-<hash>.yaml   how a night ended
         index.sqlite                       what was read of all these; made anew where it is lost
 
-Each file is written once, whole or not at all, and never changed. A process killed at any moment therefore leaves the
-old active profile or the new one; what it left unfinished is passed over by readers and tidied by the next writer.
-Writers exclude each other by a lock that dies with its process; readers need none.
+Each file is written once, whole or not at all: a process killed at any moment leaves the old active profile or the new
+one, and what is unfinished is passed over by readers and tidied by the next writer. Writers exclude each other by a
+lock that dies with its process; readers need none.
 """
 
 from __future__ import annotations
