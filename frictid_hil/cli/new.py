@@ -59,17 +59,6 @@ def _on_a_terminal() -> bool:
     return sys.stdin.isatty()
 
 
-def _asked(question: str, option: str, parse: Callable[[str], _Value], *, asks: bool) -> _Value:
-    """The answer to a question on the terminal; a mistyped one is asked for again."""
-    if not asks:
-        raise UsageError(f"{question} is not given", next_step=f"add `{option}`, or run it in a terminal")
-    try:
-        answer: _Value = typer.prompt(question, err=True, value_proc=parse)
-    except typer.Abort:
-        raise Interrupted("interrupted; no file was written") from None
-    return answer
-
-
 def _show_robot(output: Output, _result: Result) -> None:
     path = output.given["path"]
     output.say(f"{path}: look at every line, then `frictid-hil check --robot {path} --dry`")
@@ -109,8 +98,13 @@ def robot(
     from frictid_hil.jobs.new_robot import JointAnswers, new_robot
 
     def answer(given: _Value | None, question: str, option: str, parse: Callable[[str], _Value]) -> _Value:
-        asks = _on_a_terminal() and not output.as_json
-        return given if given is not None else _asked(question, option, parse, asks=asks)
+        if given is None and (output.as_json or not _on_a_terminal()):
+            raise UsageError(f"{question} is not given", next_step=f"add `{option}`, or run it in a terminal")
+        try:
+            # A mistyped answer is asked for again.
+            return given if given is not None else typer.prompt(question, err=True, value_proc=parse)
+        except typer.Abort:
+            raise Interrupted("interrupted; no file was written") from None
 
     refuse_overwriting([path], force=force)
     names = answer(joint or None, "joints and their addresses (shoulder=1 elbow=2)", "--joint", _all_named)

@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
+from functools import partial
 from inspect import Parameter
 from typing import Annotated, Any, NoReturn, Protocol, TypeVar
 
@@ -34,6 +35,8 @@ READING = "profiles read anew for the store's index"
 _COUNT_EVERY_S = 2.0
 
 NOTIFY_TIMEOUT_S = 60.0  # a command of ``--notify`` may take this long
+
+_plain_console = partial(Console, markup=False, emoji=False, highlight=False)
 
 Result = Mapping[str, Any]
 Asked = TypeVar("Asked")
@@ -65,7 +68,6 @@ class Told(Protocol):
 
     def to_json(self) -> dict[str, Any]:
         """The JSON of its verb, without the schema."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,20 +87,13 @@ class Output:
     @property
     def err(self) -> Console:
         """For people, on stderr; plain without a TTY."""
-        return Console(
-            stderr=True,
-            quiet=self.quiet or self.as_json,
-            markup=False,
-            emoji=False,
-            highlight=False,
-            soft_wrap=not sys.stderr.isatty(),
-        )
+        return _plain_console(stderr=True, quiet=self.quiet or self.as_json, soft_wrap=not sys.stderr.isatty())
 
     @property
     def out(self) -> Console:
         """For results, on stdout; silent with ``--json``."""
         width = None if sys.stdout.isatty() else 120
-        return Console(quiet=self.as_json, markup=False, emoji=False, highlight=False, width=width)
+        return _plain_console(quiet=self.as_json, width=width)
 
     def say(self, line: str) -> None:
         """A line of the result; a path in it is not cut in two."""
@@ -214,7 +209,7 @@ class Output:
 
     def _explain(self, error: Mapping[str, Any]) -> None:
         # Errors are never quiet, and never wrapped in the middle of a path.
-        console = Console(stderr=True, markup=False, emoji=False, highlight=False, soft_wrap=True)
+        console = _plain_console(stderr=True, soft_wrap=True)
         where = f"{error['where']}: " if error.get("where") else ""
         console.print(Text.assemble(("error:", "bold red"), f" {where}{error.get('what', '')}"))
         if error.get("cause"):

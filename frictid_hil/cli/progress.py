@@ -70,7 +70,7 @@ def _range_deg(low_rad: float, high_rad: float) -> str:
 
 
 def answer(question: str) -> bool:
-    """A person's yes or no; what was typed before it was shown is none (``Interrupted``: Ctrl-C, Ctrl-D, SIGTERM)."""
+    """A person's yes or no, typed after the question was shown (``Interrupted``: Ctrl-C, Ctrl-D or SIGTERM)."""
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt

@@ -40,7 +40,6 @@ def as_tuple(value: Any) -> Any:
 Numbers = Annotated[tuple[float, ...], BeforeValidator(as_tuple)]
 Pair = Annotated[tuple[float, float], BeforeValidator(as_tuple)]
 Triple = Annotated[tuple[float, float, float], BeforeValidator(as_tuple)]
-Pairs = Annotated[tuple[Pair, ...], BeforeValidator(as_tuple)]
 Names = Annotated[tuple[str, ...], BeforeValidator(as_tuple)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -263,10 +264,11 @@ def samples_in(
                 if len(samples) >= 2:
                     newest[motion.joint] = samples
     if not newest:
+        most = ", ".join(f"{count} x {name}" for name, count in Counter(account.unknown).most_common(5))
         raise InputFileError(
             "no report of a joint could be decoded",
             where=", ".join(str(log.path) for log in logs),
-            cause=f"frames that nothing describes: {_counted(account.unknown)}" if account.unknown else "",
+            cause=f"frames that nothing describes: {most}" if most else "",
             next_step="say which frame is what with `frictid-hil replay --frames` or `--eds`",
         )
     return newest
@@ -274,8 +276,3 @@ def samples_in(
 
 def _tell(at: Callable[[float], None], began_ns: int, t_ns: int) -> None:
     at((t_ns - began_ns) * 1e-9)
-
-
-def _counted(names: Mapping[str, int]) -> str:
-    most = sorted(names.items(), key=lambda item: -item[1])[:5]
-    return ", ".join(f"{count} x {name}" for name, count in most)

@@ -190,12 +190,8 @@ class _Measured:
 
     def identify(self, moved: JointRun) -> None:
         """Identify a joint from what it has just done."""
-        result: dict[str, Any] = {
-            "duration_s": moved.duration_s,
-            "rate_hz": moved.rate_hz,
-            "late_cycles": moved.late_cycles,
-            "missed_cycles": moved.missed_cycles,
-        }
+        timing = ("duration_s", "rate_hz", "late_cycles", "missed_cycles")
+        result: dict[str, Any] = {key: getattr(moved, key) for key in timing}
         name, plan = moved.joint, self._planned.plan
         others = [entry.joint for entry in plan.joints if plan.together and entry.joint != name]
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict
 from typing import Any
 
@@ -29,13 +30,11 @@ def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0, dr
         driver = new_driver(robot.driver(bus), setup)
     identities: Mapping[str, JointIdentity] = {}
     if not dry:
-        try:
+        with closing(driver):
             with robot.document.locating():
                 driver.open()
             findings.extend(driver.check(plan))
             identities = driver.identify()
-        finally:
-            driver.close()
     measured = None
     if latency_s:
         # In a process of its own, as the cyclic loop is, because what makes it punctual cannot be undone.

@@ -168,7 +168,6 @@ class GuidedBySimulation(Protocol):
 
     def simulate_hand(self, joint: str, centre_rad: float, amplitude_rad: float, frequency_hz: float) -> None:
         """Guide the joint along centre + amplitude sin(2 pi f t) from now; frequency 0 lets go."""
-        ...
 
 
 Live = Callable[[str], None]  # told a line of figures twice a second while a service runs

@@ -21,7 +21,7 @@ from frictid_hil.errors import UsageError
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.runner.ring import Rows
+from frictid_hil.runner.ring import SAMPLE_ROW, Rows
 
 if TYPE_CHECKING:
     from frictid_hil.jobs.foxglove import FoxgloveServer
@@ -30,15 +30,7 @@ DEFAULT_ADDRESS = "127.0.0.1:8765"
 LIVE_HZ = 100.0  # messages a joint and second of run time; the recording has every sample
 _MOST_TOLD = 10  # refused origins that a person hears of
 
-_COLUMNS = (
-    "position_rad",
-    "velocity_rad_s",
-    "torque_nm",
-    "position_command_rad",
-    "torque_command_nm",
-    "external_torque_nm",
-    "temperature_c",
-)
+_COLUMNS = tuple(name for name in SAMPLE_ROW.names or () if SAMPLE_ROW[name].kind == "f")
 _SCHEMA = {
     "title": "frictid.sample",
     "type": "object",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,12 +76,9 @@ def new_robot(
 
 def _read(driver: str, setup: RobotSetup) -> dict[str, dict[str, float]]:
     """Ask each drive for its gear ratio and its rated torque."""
-    drives = new_driver(driver, setup)
-    try:
+    with closing(new_driver(driver, setup)) as drives:
         drives.open()
         identities = drives.identify()
-    finally:
-        drives.close()
     return {
         joint: {
             key: value

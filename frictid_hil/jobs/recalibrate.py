@@ -68,7 +68,7 @@ def recalibrate(options: RecalibrateOptions, watcher: Watcher) -> dict[str, Any]
     store = ProfileStore(options.store)
     began_utc = utc_now()
     try:
-        with _terminable(), _alone(store, robot):
+        with handling_signals(_stopped), _alone(store, robot):
             result = _night(options, robot, store, watcher)
     except Exception as error:
         told = error if isinstance(error, FrictidError) else Defect.of(error)
@@ -175,30 +175,21 @@ def _alone(store: ProfileStore, robot: Robot) -> Iterator[None]:
     """One recalibration of a robot at a time; the lock dies with its process."""
     folder = store.root / robot.name
     made_folder(folder, UsageError)
-    lock = filelock.FileLock(folder / ".recalibrate.lock")
     try:
-        lock.acquire(timeout=0)
+        lock = filelock.FileLock(folder / ".recalibrate.lock").acquire(timeout=0)
     except filelock.Timeout:
         raise HardwareBusy(
             f"another recalibration of {robot.name} is at work",
             where=str(folder),
             next_step="wait for it to end; nothing was moved by this one",
         ) from None
-    try:
+    with lock:
         yield
-    finally:
-        lock.release()
 
 
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
+def _stopped(*_: object) -> NoReturn:
     """SIGTERM outside motion ends the job like Ctrl-C, with its line and exit code; inside, the runner handles it."""
-
-    def stop(*_: object) -> NoReturn:
-        raise Interrupted("stopped by a signal; nothing was moving", next_step="start it again when it suits")
-
-    with handling_signals(stop):
-        yield
+    raise Interrupted("stopped by a signal; nothing was moving", next_step="start it again when it suits")
 
 
 # -- history --------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 from frictid_hil.config.robot import load_robot
@@ -22,15 +23,13 @@ def reset(robot_name: str, *, bus: str | None = None, ask: Callable[[list[Findin
             where=setup.bus,
             next_step="reset them at the controller",
         )
-    try:
+    with closing(driver):
         driver.open()
         faults = driver.faults()
         if faults and not ask(faults):
             raise PlanRefused("not confirmed; nothing was reset")
         if faults:
             driver.reset_faults()
-    finally:
-        driver.close()
     return {
         "outcome": "ok",
         "robot": robot.name,

@@ -163,8 +163,6 @@ class _Piece(ctypes.Structure):
 
 MOST = 64
 """Packets in one call of the system."""
-CLASSICAL_BYTES, FD_BYTES = 16, 72
-"""``struct can_frame`` and ``struct canfd_frame`` of Linux."""
 _NOT_OURS, _ERROR_FRAME = 0xC000_0000, 0x2000_0000
 _BIT_RATE_SWITCH = 1
 
@@ -190,13 +188,9 @@ class _Packets:
 
 
 class SocketFrames:
-    """A socket whose packets are SocketCAN's, in as few calls of the system as there can be.
+    """A socket whose packets are SocketCAN's, in as few calls of the system as there can be; nobody else reads it."""
 
-    Args:
-        wire: SocketCAN's, or one of the simulated bus; nobody else reads it meanwhile.
-        stamped: packets end with when they were sent, ns of the monotonic clock (the simulated bus).
-    """
-
+    # ``stamped`` packets end with when they were sent, ns of the monotonic clock (the simulated bus).
     def __init__(self, wire: socket.socket, *, stamped: bool = False) -> None:
         self.controller = ""
         self._wire, self._fd, self._stamped = wire, wire.fileno(), stamped

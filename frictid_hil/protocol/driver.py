@@ -340,22 +340,16 @@ class Batched(Protocol):
 
     def run_batch(
         self,
-        plan: JointPlan,
+        plan: JointPlan,  # the joint stands where its first motion begins
         *,
-        stop: Callable[[], bool],
-        progress: Callable[[str, float], None],
+        stop: Callable[[], bool],  # asked often; True brings the joint to rest and raises ``Interrupted``
+        progress: Callable[[str, float], None],  # told ``motion`` or ``transfer`` and the share that is done
+        # Given ``standing`` several times while the joint moves; its ``SafetyAbort`` brings the joint to rest.
         look: Callable[[Sequence[Feedback]], None],
+        # Given every portion of samples as it comes (the first five columns below), in order and without a gap.
         arrived: Callable[[Mapping[str, Any]], None],
     ) -> Mapping[str, Any]:
         """One joint's motions as one job; blocks until the joint stands again and its recording is here.
-
-        Args:
-            plan: the joint stands where its first motion begins.
-            stop: asked often; True brings the joint to rest and raises ``Interrupted``.
-            progress: told ``motion`` or ``transfer`` and the share that is done.
-            look: given ``standing`` several times while the joint moves; its ``SafetyAbort`` brings the joint to rest.
-            arrived: given every portion of samples as it comes (the first five columns below), in order and without
-                a gap: all that ``batch_columns`` hold in the end.
 
         Returns:
             Columns of shape (n,): ``time_ns`` (run time), ``position_rad``, ``velocity_rad_s``, ``torque_nm``,

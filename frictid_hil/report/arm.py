@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from frictid_hil.friction.metrics import paired_ratio_interval, rms_by_part
+from frictid_hil.friction.metrics import paired_ratio_interval, plain_rms, rms_by_part
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.where import by_region
@@ -98,21 +96,18 @@ def _before_and_after(runs: Sequence[JointRun]) -> Table:
     for run in runs:
         parts = max(2, int((run.time_s[-1] - run.time_s[0]) / PART_S))
         before = rms_by_part(run.measured - run.nominal, parts)
-        told = [run.joint, run.quantity, f"{_rms(before):.3g}", "-", "-"]
+        told = [run.joint, run.quantity, f"{plain_rms(before):.3g}", "-", "-"]
         if run.improved is not None:
             after = rms_by_part(run.measured - run.improved, parts)
             left = paired_ratio_interval(before, after)
-            told[3] = f"{_rms(after):.3g}"
+            told[3] = f"{plain_rms(after):.3g}"
             if left is not None:
-                told[4] = f"{100 * _rms(after) / _rms(before):.0f} % ({100 * left[0]:.0f} to {100 * left[1]:.0f} %)"
+                share = 100 * plain_rms(after) / plain_rms(before)
+                told[4] = f"{share:.0f} % ({100 * left[0]:.0f} to {100 * left[1]:.0f} %)"
         rows.append(tuple(told))
     headings = ("joint", "difference to the machine", "your model", "improved", "left, noise included")
     caption = f"RMS along the motion below; in brackets the 95 % interval, from parts of {PART_S:g} s."
     return Table(headings, tuple(rows), caption=caption)
-
-
-def _rms(parts: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(parts))))
 
 
 def _beside(run: JointRun) -> Figure:

@@ -18,14 +18,12 @@ from frictid_hil.plan.control import Compensated, ControlLaw
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Feedback, SetPoint
 
-_VELOCITY_LOOP_PER_S = 5.0
-"""Share of a position error that a drive in velocity mode is asked to make good per second."""
+_VELOCITY_LOOP_PER_S = 5.0  # share of a position error that a drive in velocity mode is asked to make good per second
 
 _AHEAD_CYCLES = 1.5
 """From the instant of a report to the middle of the cycle in which the torque answering it is applied."""
 
-Reference = tuple[float, float]
-"""Position, rad, and velocity, rad/s."""
+Reference = tuple[float, float]  # position, rad, and velocity, rad/s
 
 
 class LawInForce:

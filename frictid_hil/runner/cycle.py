@@ -32,7 +32,6 @@ class StopRequest(Protocol):
     @property
     def level(self) -> int:
         """NOTHING_ASKED, DECELERATE or QUICK_STOP; read once per cycle."""
-        ...
 
 
 class SetPointSource(Protocol):
@@ -40,7 +39,6 @@ class SetPointSource(Protocol):
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
         """Write the coming cycle's set-point from the last feedback; False when the motion is over."""
-        ...
 
 
 class Stream:

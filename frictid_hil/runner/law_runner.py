@@ -24,12 +24,10 @@ from frictid_hil.runner.runaway import RunawayWatch
 from frictid_hil.runner.supervisor import JointLimits
 
 _FADE_S = 0.2
-_LISTEN_S = 0.1
-"""How long the holding torque is averaged."""
+_LISTEN_S = 0.1  # how long the holding torque is averaged
 _LET_GO_S = 0.3
 _MODE_TIMEOUT_S = 0.5
-_NOISE_SHARE = 0.05
-"""Reported torque may exceed the commanded one by this share of the rated torque."""
+_NOISE_SHARE = 0.05  # reported torque may exceed the commanded one by this share of the rated torque
 
 
 @dataclass

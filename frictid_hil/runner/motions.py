@@ -29,10 +29,8 @@ from frictid_hil.runner.sign_watch import SignWatch
 from frictid_hil.runner.supervisor import JointLimits
 from frictid_hil.runner.warm_up import WarmUpWatch
 
-AT_RAD = 1e-4
-"""A joint this near to where it should be needs no approach."""
-REHEARSAL_TORQUE = 0.5
-"""Share of a joint's maximum torque that its rehearsal may take."""
+AT_RAD = 1e-4  # a joint this near to where it should be needs no approach
+REHEARSAL_TORQUE = 0.5  # share of a joint's maximum torque that its rehearsal may take
 
 
 def from_here(here_rad: float, motions: Sequence[Motion], approach_rad_s: float) -> list[Motion]:

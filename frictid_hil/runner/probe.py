@@ -39,7 +39,7 @@ class ProbeWatch:
         return self.source.update(feedback, set_point)
 
     def judge(self) -> None:
-        """Compare it with the profile (``SafetyAbort``: not both ways; ``ProfileMismatch``: both values)."""
+        """Compare it with the profile (``SafetyAbort``: no motion both ways; ``ProfileMismatch``: other friction)."""
         position, velocity, torque = (
             (np.array(column) for column in zip(*self._rows, strict=True)) if self._rows else (np.empty(0),) * 3
         )

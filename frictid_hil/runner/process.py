@@ -42,14 +42,10 @@ from frictid_hil.runner.stop_signals import HeardStop, StopSignals
 
 _PR_SET_PDEATHSIG = 1
 _POLL_S = 0.05
-_SILENT_S = 30.0
-"""Configuring drives may take its time; what lasts longer without a word hangs ..."""
-_SILENT_STOPPING_S = 5.0
-"""... and so does what is silent for so long after a stop was asked for."""
-_ENDING_S = 15.0
-"""Longest way from a stop to the end of the process."""
-_WITHOUT_POWER = ("configure", "reference")
-"""Phases of a joint in which no drive has power."""
+_SILENT_S = 30.0  # configuring drives may take its time; what lasts longer without a word hangs ...
+_SILENT_STOPPING_S = 5.0  # ... and so does what is silent for so long after a stop was asked for.
+_ENDING_S = 15.0  # longest way from a stop to the end of the process
+_WITHOUT_POWER = ("configure", "reference")  # phases of a joint in which no drive has power
 
 
 class _Life:

@@ -30,7 +30,8 @@ WAKE_TIME = Path("/dev/cpu_dma_latency")
 
 
 def make_punctual() -> list[str]:
-    """Ask for real-time scheduling, locked memory, awake processors, no garbage collection; what was refused, why."""
+    """Ask for real-time scheduling, locked memory, awake processors, no gc; returns what was refused, with remedies."""
+    # For a process of its own: what it was given lasts until it ends.
     told = []
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
@@ -57,7 +58,7 @@ def make_punctual() -> list[str]:
 
 
 def _keep_processors_awake() -> bool:
-    """No idle processor may sleep so that it takes time to wake, while this process lives; False: not permitted."""
+    """Keep every processor awake for as long as this process lives; False where that was not permitted."""
     # The bound holds while the file is open. Source: Documentation/power/pm_qos_interface.rst.
     try:
         kept_open = os.open(WAKE_TIME, os.O_WRONLY)

@@ -48,8 +48,7 @@ FRAME_ROW = np.dtype(
 PACK_SAMPLE = struct.Struct("<q7dIHH")
 PACK_FRAME = struct.Struct("<qIBBH64s")
 
-_SHARED = Path("/dev/shm")
-"""Where Linux keeps shared memory by name."""
+_SHARED = Path("/dev/shm")  # where Linux keeps shared memory by name
 _HEADER_BYTES = 64
 _WORD = 0xFFFFFFFF
 _TAIL, _DROPPED = range(2)

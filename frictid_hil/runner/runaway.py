@@ -10,14 +10,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-_ALONE_RAD_S = math.radians(5.0)
-"""Speed gained with nobody pushing."""
-_GROWN_RAD_S = math.radians(10.0)
-"""Speed gained in one go, where nobody knows who pushes."""
-_FELL_RAD_S = math.radians(2.0)
-"""A fall by this much ends a growth."""
-_SMOOTHED_S = 0.01
-"""Speed and push alike, so that neither is late against the other."""
+_ALONE_RAD_S = math.radians(5.0)  # speed gained with nobody pushing
+_GROWN_RAD_S = math.radians(10.0)  # speed gained in one go, where nobody knows who pushes
+_FELL_RAD_S = math.radians(2.0)  # a fall by this much ends a growth
+_SMOOTHED_S = 0.01  # speed and push alike, so that neither is late against the other
 
 
 @dataclass

@@ -38,8 +38,7 @@ from frictid_hil.runner.supervisor import JointLimits, Supervisor
 from frictid_hil.runner.unit_proof import PROOF
 from frictid_hil.runner.workspace_watch import WorkspaceWatch
 
-_LOCKED_REPORT_S = 0.010
-"""Locked joints report at least this often, whatever the layout of the bus."""
+_LOCKED_REPORT_S = 0.010  # locked joints report at least this often, whatever the layout of the bus
 _SESSION_GAP_NS = 1_000_000_000
 
 

@@ -14,23 +14,18 @@ from frictid_hil.protocol.driver import Feedback
 from frictid_hil.units import format_angle, format_torque, format_velocity
 
 _WINDOW_S = 0.1
-_OFF_SHARE = 0.25
-"""Position and velocity may differ by so much of the longer way ..."""
-_OFF_S = 0.015
-"""... and by what delays and filters of the velocity make while it changes ..."""
-_OFF_RAD = math.radians(0.4)
-"""... and by rounded figures."""
+_OFF_SHARE = 0.25  # position and velocity may differ by so much of the longer way ...
+_OFF_S = 0.015  # ... and by what delays and filters of the velocity make while it changes ...
+_OFF_RAD = math.radians(0.4)  # ... and by rounded figures.
 _JUMP_SHARE = 2.0
 _JUMP_RAD = math.radians(0.3)
 """From one report to the next a joint moves no further than its highest speed lets it, twice, and this."""
 _BOTH_WAYS_RAD_S = math.radians(4.0)
-_BOTH_WAYS_RAD = math.radians(0.5)
-"""A torque has been seen in a direction once the joint moved so far at such a speed."""
+_BOTH_WAYS_RAD = math.radians(0.5)  # a torque has been seen in a direction once the joint moved so far at such a speed
 _AT_ONCE_RAD_S, _AT_ONCE_SHARE, _AT_ONCE_REPORTS = math.radians(15.0), 0.1, 3
 """No joint under torque control stands from such a speed from one report to the next, to the last digit for so many:
 its encoder does, or it has hit something."""
-_YIELDS_S = 0.02
-"""A torque that a joint cannot stand moves it within this time, reports included."""
+_YIELDS_S = 0.02  # a torque that a joint cannot stand moves it within this time, reports included
 _SAME_RAD = math.radians(1.0)
 """A set-point that went so far changes the torque of a joint that stands, unless its reports are old ones."""
 
@@ -79,7 +74,7 @@ class SensorWatch:
         self._at_rad, self._commanded_nm, self._beyond_ns = math.nan, (0.0, 0.0), 0
 
     def verdict(self, report: Feedback, most_rad_s: float, *, asked_rad: float = math.nan) -> str:
-        """What is wrong with a new report, or "". A torque depends on the direction where a loop holds a joint."""
+        """What is wrong with a new report, or ""; torque is judged where a loop holds the joint, at ``asked_rad``."""
         t_ns, position, velocity = report.t_ns, report.position_rad, report.velocity_rad_s
         rows = self._rows
         if not rows:

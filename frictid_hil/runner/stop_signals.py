@@ -19,8 +19,7 @@ from typing import TypeVar
 from frictid_hil.errors import Interrupted
 from frictid_hil.runner.cycle import DECELERATE, NOTHING_ASKED, QUICK_STOP
 
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""A closed terminal hangs up."""
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # a closed terminal hangs up
 
 Answer = TypeVar("Answer")
 

@@ -14,8 +14,7 @@ from scipy.ndimage import maximum_filter1d
 
 from frictid_hil.friction.trajectory import Array
 
-DURATIONS_S = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
-"""Stops to choose from, the shortest first; none lasts longer."""
+DURATIONS_S = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)  # stops to choose from, the shortest first; none lasts longer
 _STRIDE_S = 0.005
 """Accelerations are formed over so long, because second differences of neighbouring set-points are rough."""
 _OWN_SHARE = 1.2
@@ -54,13 +53,7 @@ def stopping_path(path_rad: Array, period_s: float, most_rad_s2: Sequence[float]
 
 def _accelerations(path_rad: Array, stride: int, period_s: float) -> Array:
     """Magnitude of the acceleration at every row, formed over ``stride`` cycles to either side; shape of the path."""
-    padded = np.vstack([_before(path_rad, stride), path_rad, np.repeat(path_rad[-1:], stride, axis=0)])
+    before = path_rad[0] + np.arange(-stride, 0)[:, None] * (path_rad[1] - path_rad[0])  # on at the first row's speed
+    padded = np.vstack([before, path_rad, np.repeat(path_rad[-1:], stride, axis=0)])
     second: Array = padded[2 * stride :] - 2.0 * padded[stride:-stride] + padded[: -2 * stride]
     return np.abs(second) / (stride * period_s) ** 2
-
-
-def _before(path_rad: Array, stride: int) -> Array:
-    """Continue the path backwards at the speed of its first row, for ``stride`` rows."""
-    step = path_rad[1] - path_rad[0]
-    rows: Array = path_rad[0] + np.arange(-stride, 0)[:, None] * step
-    return rows

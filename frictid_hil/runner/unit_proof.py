@@ -20,8 +20,7 @@ from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.runner.sensor_watch import velocity_says
 from frictid_hil.units import format_angle
 
-PROOF = "units"
-"""Phase of a run."""
+PROOF = "units"  # phase of a run
 
 _STEPS = 10
 _STEPS_LEAST_RAD, _STEPS_MOST_RAD = math.radians(0.005), math.radians(0.1)
@@ -30,12 +29,9 @@ _PEAK_RAD_S = math.radians(3.0)
 _HOLD_S = 0.1
 _RUNAWAY = 3.0
 _SLACK_RAD = math.radians(0.1)
-_FOLLOWED = 0.3
-"""Share of a motion that a position loop may leave undone, beyond its declared droop."""
-_VELOCITY_OFF = 0.2
-"""Share by which two travels may differ. A wrong unit makes at least a factor of 2."""
-_COARSE = 0.25
-"""Share of the mean speed. A velocity that is reported in coarser steps tells nothing."""
+_FOLLOWED = 0.3  # share of a motion that a position loop may leave undone, beyond its declared droop
+_VELOCITY_OFF = 0.2  # Share by which two travels may differ. A wrong unit makes at least a factor of 2.
+_COARSE = 0.25  # Share of the mean speed. A velocity that is reported in coarser steps tells nothing.
 
 
 @dataclass

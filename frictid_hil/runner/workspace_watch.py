@@ -11,10 +11,8 @@ from frictid_hil.errors import SafetyAbort
 from frictid_hil.plan.workspace import Workspace
 from frictid_hil.protocol.driver import Feedback
 
-INTERVAL_S = 0.02
-"""At 1 m/s the arm moves 2 cm in between."""
-SLACK_M = 0.01
-"""How far beyond the box a joint that lags or overshoots its command may carry the arm."""
+INTERVAL_S = 0.02  # at 1 m/s the arm moves 2 cm in between
+SLACK_M = 0.01  # how far beyond the box a joint that lags or overshoots its command may carry the arm
 
 
 class WorkspaceWatch:

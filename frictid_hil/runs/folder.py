@@ -62,7 +62,7 @@ class RunFolder:
 
     @staticmethod
     def create(robot: Robot, verb: str, options: Mapping[str, Any], out: Path | None = None) -> RunFolder:
-        """A new folder, that may hold other things, and nothing of a run.
+        """A new folder, ``runs/<robot>/<UTC>-<verb>`` unless told; it may hold other things, but nothing of a run.
 
         ``UsageError``: it holds a run, or a file of one. ``FrictidError``: no permission, no space; nothing is left.
         """
@@ -94,7 +94,7 @@ class RunFolder:
 
     @staticmethod
     def resume(path: Path, robot: Robot) -> RunFolder:
-        """A folder to go on with, as it is until ``begin`` (``UsageError``: none, or of another configuration)."""
+        """A folder to go on with, as it is until ``begin`` (``UsageError``: none, or another's; ``HardwareBusy``)."""
         folder = RunFolder(path, manifest_of(path, robot))
         folder._hold()
         return folder

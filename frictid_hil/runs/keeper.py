@@ -19,7 +19,7 @@ _FLUSH_S = 0.25
 
 
 class RowKeeper:
-    """Writes rows as they come, into new files, and remembers them; ``seen`` gets them then (``FrictidError``)."""
+    """Writes rows as they come, remembers them, tells ``seen`` (``FrictidError``: cannot open; no file stays open)."""
 
     def __init__(
         self, samples: Path, frames: Path, joints: list[str], meta: Mapping[str, Any], seen: Callable[[Rows], None]

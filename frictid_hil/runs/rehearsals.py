@@ -57,9 +57,10 @@ class Rehearsals:
         )
 
     def heed(self, event: Event, plan: Plan) -> None:
-        """Keep what a finished run rehearsed; refuse, and forget, an exchanged drive that is not going to rehearse.
+        """Keep what a finished run rehearsed; refuse an exchanged drive if its joint is not going to rehearse.
 
-        ``UsageError``: exchanged. ``FrictidError``: what was rehearsed cannot be written.
+        ``UsageError``: exchanged; what it rehearsed is forgotten. ``FrictidError``: what was rehearsed cannot be
+        written.
         """
         if self._simulated:
             return

@@ -12,8 +12,7 @@ import can
 from frictid_hil.protocol.can_frames import identifier_of, message_of
 from frictid_hil.protocol.driver import Clock
 
-Frame = tuple[int, bytes]
-"""Identifier (bit 31: 29 bits, bit 29: CAN FD) and data."""
+Frame = tuple[int, bytes]  # identifier (bit 31: 29 bits, bit 29: CAN FD) and data
 
 
 class Devices(Protocol):
@@ -27,15 +26,12 @@ class Devices(Protocol):
 
 
 class ManualClock:
-    """Run time in lock-step: it passes only while somebody waits for it.
-
-    ``advance`` is told how far time goes on, ns since this clock was made.
-    """
+    """Run time in lock-step: it passes only while somebody waits for it."""
 
     lock_step = True
 
     def __init__(self, advance: Callable[[int], None] = lambda _: None) -> None:
-        self._advance = advance
+        self._advance = advance  # told how far time goes on, ns since this clock was made
         self._now_ns = self._origin_ns = 0
 
     def restart(self) -> None:
@@ -54,21 +50,15 @@ class ManualClock:
 
 
 class FakeCanBus(can.BusABC):
-    """The host's end of a wire with devices of yours; answers are there when ``send`` returns.
+    """The host's end of a wire with devices of yours; answers are there when ``send`` returns."""
 
-    Args:
-        devices: on the wire.
-        clock: in lock-step it lets the devices go on by itself; on the wall clock this bus does when it is touched.
-
-    Attributes:
-        fault: passed every frame and whether it goes to the host; returns what becomes of it: [] for lost.
-    """
-
+    # In lock-step the clock lets the devices go on by itself; on the wall clock this bus does when it is touched.
     def __init__(self, devices: Devices, clock: Clock) -> None:
         self._devices = devices
         self._clock = clock
         self._started_ns = time.monotonic_ns()
         self._queue: deque[can.Message] = deque()
+        # Passed every frame and whether it goes to the host; returns what becomes of it: [] for lost.
         self.fault: Callable[[Frame, bool], list[Frame]] | None = None
         self.channel_info = "fake bus"
         super().__init__(channel="fake")

@@ -41,10 +41,8 @@ def why_no_closed_loop(arm: ArmSet, motions: Sequence[Motion]) -> str | None:
 def closed_loop_gap(arm: ArmSet, natives: Mapping[str, Native]) -> dict[str, Any]:
     """The user's own model, as it was and changed, run in MuJoCo along the logs that were not fitted.
 
-    Returns:
-        ``before`` and ``after`` by joint (``torque_nm``, ``position_rad``; RMS of the difference to the recording,
-        torque behind a low-pass) and ``left``, by changed joint, what is left of it (of the torque, or without one of
-        the position) with its 95 % interval, percent; or ``reason``.
+    By joint ``before`` and ``after`` (RMS of the difference, torque behind a low-pass) and ``left_percent`` with its 95
+    % interval, of the torque or else of the position; or ``reason``.
     """
     motions, names = withheld(arm), arm.recorded
     if reason := why_no_closed_loop(arm, motions):

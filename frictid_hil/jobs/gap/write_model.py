@@ -271,14 +271,11 @@ Effects = Mapping[str, Mapping[str, float]]
 
 
 def nearer_only(arm: ArmSet, made: Mapping[str, Export]) -> tuple[dict[str, Export], dict[str, Any]]:
-    """The changes after which each changed joint is nearer to the machine, in the user's own closed loop.
+    """The changes after which each joint is nearer to the machine in closed loop, and ``closed_loop_gap`` with them.
 
     A joint whose interval reaches the gap that it had gets a part of its causes instead, the one that comes nearest
-    along the motions that were fitted; if that is no nearer either, the joint stays as the user had it.
-
-    Returns:
-        The changes that stand, and ``closed_loop_gap`` with them. Its ``left_out`` says by joint which ``effects`` were
-        not written, ``left_percent`` of the gap with them, and ``instead``, what was written.
+    along the fitted motions, if any does. ``left_out`` says by joint which ``effects`` were not written,
+    ``left_percent`` of the gap with them, and what was written ``instead``.
     """
     kept = dict(made)
     left_out: dict[str, Any] = {}

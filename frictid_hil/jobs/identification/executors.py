@@ -56,17 +56,13 @@ def answers(
             try:
                 answer = pool.submit(function, task).result()
             except Exception as lost:
-                yield _lost(lost)
+                yield FrictidError(
+                    f"the worker gave no answer: {type(lost).__name__}: {lost}",
+                    cause="the worker was killed (memory?), or runs another version",
+                    next_step="identify this recording alone, without --executor",
+                )
                 continue
         yield answer
-
-
-def _lost(cause: Exception) -> FrictidError:
-    return FrictidError(
-        f"the worker gave no answer: {type(cause).__name__}: {cause}",
-        cause="the worker was killed (memory?), or runs another version",
-        next_step="identify this recording alone, without --executor",
-    )
 
 
 CONNECT_TIMEOUT = "10s"
