@@ -3,10 +3,6 @@
 Scheduler, supervisor and recording are those of a calibration. Experiments without the payload run first. Then a person
 is asked to mount it (a simulated robot mounts its own), and the rest follow. An interrupted recording can be continued,
 or a set can be made of what it has without moving anything.
-
-``--until-decided`` begins with three experiments: a slow one, a fast one and one that is judged on. After each
-diagnosis that cannot decide, the experiment that is expected to tell most is added to the set, as long as the time that
-was given lasts.
 """
 
 from __future__ import annotations

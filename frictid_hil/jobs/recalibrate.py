@@ -167,9 +167,6 @@ def _apply(verdict: Verdict, result: dict[str, Any], store: ProfileStore, robot:
         result |= {"outcome": refused.outcome, "exit_code": refused.exit_code, "error": refused.to_json()}
 
 
-# -- alone, and ending in order -------------------------------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def _alone(store: ProfileStore, robot: Robot) -> Iterator[None]:
     """One recalibration of a robot at a time; the lock dies with its process."""
@@ -190,9 +187,6 @@ def _alone(store: ProfileStore, robot: Robot) -> Iterator[None]:
 def _stopped(*_: object) -> NoReturn:
     """SIGTERM outside motion ends the job like Ctrl-C, with its line and exit code; inside, the runner handles it."""
     raise Interrupted("stopped by a signal; nothing was moving", next_step="start it again when it suits")
-
-
-# -- history --------------------------------------------------------------------------------------------------------
 
 
 def _attempt(began_utc: str, result: dict[str, Any], policy: Policy) -> Attempt:

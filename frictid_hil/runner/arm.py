@@ -114,8 +114,6 @@ class Arm:
             # The wire itself failed: the drives' own watchdogs finish what the quick stop began.
             self.loop.driver.quick_stop()
 
-    # -- inside -------------------------------------------------------------------------------------------------
-
     def _aim_where_it_stands(self) -> None:
         for set_point, report in zip(self.loop.set_points, self.loop.feedback, strict=True):
             set_point.position_rad = report.position_rad

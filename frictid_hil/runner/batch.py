@@ -101,8 +101,6 @@ class BatchRunner:
         )
         return run, end_ns
 
-    # -- one job ------------------------------------------------------------------------------------------------
-
     def _jobs(self, here_rad: float, motions: Sequence[Motion]) -> list[list[Motion]]:
         """Jobs, cut behind the rehearsal: all that is measured is one job, without a transfer or a pause in between."""
         every = from_here(here_rad, motions, self.care.approach_rad_s)
@@ -197,8 +195,6 @@ class BatchRunner:
         """Check that every joint but the one that runs stands under power where it is held."""
         self.supervisor.watch(None, Mode.POSITION, dict(held))
         self.supervisor.check([SetPoint() for _ in reports], reports)
-
-    # -- before the first job -----------------------------------------------------------------------------------
 
     def _see_power(self) -> None:
         for name, report in zip(self._names, self.driver.standing(), strict=True):

@@ -141,8 +141,6 @@ class Scheduler:
             )
         return Preflight(identities, capabilities, tuple(findings))
 
-    # -- one joint, or several in step --------------------------------------------------------------------------
-
     def _run_stretch(self, session: int, plans: Sequence[JointPlan]) -> list[JointRun]:
         driver = self.driver
         moving = {self._names.index(plan.joint): plan for plan in plans}

@@ -99,8 +99,6 @@ class RunFolder:
         folder._hold()
         return folder
 
-    # -- while it runs ------------------------------------------------------------------------------------------
-
     # Joints in the order of the driver; ``seen`` is given the rows, once they are kept.
     def add_part(self, joints: list[str], seen: Callable[[Rows], None]) -> RowKeeper:
         """New files beside earlier parts (``FrictidError``: they cannot be made; the folder is as it was)."""
@@ -186,8 +184,6 @@ class RunFolder:
     def save(self) -> None:
         """Write the manifest."""
         self._write("manifest.json", json.dumps(self.manifest, indent=1))
-
-    # -- inside -------------------------------------------------------------------------------------------------
 
     def _claim(self) -> None:
         """Make the folder, or take one that holds nothing of a run, and keep other processes out of it."""

@@ -232,8 +232,6 @@ class Run:
                 raise
         return ended
 
-    # -- inside -------------------------------------------------------------------------------------------------
-
     def _in(self, *states: State) -> State:
         if self.state not in states:
             raise self._wrong(" or ".join(state.value for state in states))

@@ -138,7 +138,9 @@ def sets_from_model(asked: ModelLogs) -> ArmSet:
     if not sets:
         raise InputFileError("no joint moves in these logs", where=str(asked.logs[0]))
     still = tuple(name for name in names if name not in sets)
-    return ArmSet(robot, motions, {**_reference(robot, names), **held}, sets, found, still)
+    reference, places = robot.compiled.qpos0, robot.compiled.jnt_qposadr
+    usual = {name: float(reference[int(places[robot.number(name)])]) for name in robot.joints if name not in names}
+    return ArmSet(robot, motions, {**usual, **held}, sets, found, still)
 
 
 def _moves(samples: Samples) -> bool:
@@ -249,12 +251,6 @@ def kinematics(time_s: Array, position_rad: Array) -> tuple[Array, Array, Array]
         slope = np.diff(position_rad, axis=0) / np.diff(time_s)[:, None]
         acceleration[1:-1] = 2.0 * (slope[1:] - slope[:-1]) / (ahead + behind)
     return position_rad, velocity, acceleration
-
-
-def _reference(robot: RobotModel, logged: Sequence[str]) -> dict[str, float]:
-    reference = robot.compiled.qpos0
-    places = {name: int(robot.compiled.jnt_qposadr[robot.number(name)]) for name in robot.joints}
-    return {name: float(reference[place]) for name, place in places.items() if name not in logged}
 
 
 def _ask_for_places(robot: RobotModel, motions: Sequence[Motion], held: Mapping[str, float]) -> None:
