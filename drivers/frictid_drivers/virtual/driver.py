@@ -24,7 +24,7 @@ from frictid_drivers.virtual.rack_launcher import RunningRack, start_rack
 from frictid_drivers.virtual.socket_bus import SocketBus
 from frictid_hil.errors import HardwareError, InvalidFields, UsageError
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import Capabilities, DriverKind, FrameSink, WallClock, unknown_options
+from frictid_hil.protocol.driver import DriverKind, FrameSink, WallClock, unknown_options
 from frictid_hil.simulation.joint import JointModel
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class VirtualDriver:
         self._process: RunningRack | None = None
         self.clock: LockStepClock | WallClock = WallClock() if setup.realtime else LockStepClock(self._drives)
         self._host = host = Cia402Driver(_told_to_host(setup), bus_factory=self._open_bus, clock=self.clock)
-        self.identify, self.check = host.identify, host.check
+        self.identify, self.capabilities, self.check = host.identify, host.capabilities, host.check
         self.faults, self.reset_faults = host.faults, host.reset_faults
         self.configure, self.set_limits, self.remarks = host.configure, host.set_limits, host.remarks
         self.frame_map_values = host.frame_map_values
@@ -114,10 +114,6 @@ class VirtualDriver:
     def may_be_powered(self) -> tuple[str, ...]:
         """As ``driver.Driver``."""
         return self._host.may_be_powered
-
-    def capabilities(self) -> Capabilities:
-        """What the host driver says of these drives, and whether time is theirs."""
-        return replace(self._host.capabilities(), lock_step=not self._setup.realtime)
 
     def simulate_hand(
         self, joint: str, centre_rad: float = 0.0, amplitude_rad: float = 0.0, frequency_hz: float = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from enum import Enum
 from typing import cast
@@ -101,8 +102,7 @@ class PowerStage:
         host_missing: Callable[[], bool],  # asked before power is given: a watched heartbeat is missing
     ) -> None:
         self._manner = dictionary.manner
-        self._mode_due_ns: int | None = None
-        self._enable_due_ns: int | None = None
+        self._due_ns: dict[str, int] = {}  # when the mode shows, and power comes on, in families that take their time
         self._values = cast("dict[Key, int]", dictionary.values)
         self._axis = axis
         self._plant = plant
@@ -122,7 +122,7 @@ class PowerStage:
     def boot(self) -> None:
         """Transitions 0 and 1: power-on, without motor power; the objects have their defaults again."""
         self._power(False)
-        self._mode_due_ns = self._enable_due_ns = None
+        self._due_ns.clear()
         self._controlword = 0
         self._outputs = 0
         self._axis.encoder_stuck = False
@@ -139,9 +139,9 @@ class PowerStage:
             self.fault(code)
         if axis.ramping and axis.ramp_done:
             self._ramp_ended()
-        if self._mode_due_ns is not None and axis.now_ns >= self._mode_due_ns:
+        if axis.now_ns >= self._due_ns.get("mode", math.inf):
             self.follow_commands()
-        if self._enable_due_ns is not None and axis.now_ns >= self._enable_due_ns:
+        if axis.now_ns >= self._due_ns.get("power", math.inf):
             self._follow_controlword(self._values[_K6040])
 
     def fault(self, code: int) -> None:
@@ -166,7 +166,7 @@ class PowerStage:
         if controlword != self._controlword:
             self._follow_controlword(controlword)
         mode = values[_K6060]
-        if mode != values[_K6061] and (mode in MODES or mode == 0) and self._mode_is_due():
+        if mode != values[_K6061] and (mode in MODES or mode == 0) and self._is_due("mode"):
             values[_K6061] = mode
             self.changed = True
             self._axis.set_mode(CSP if mode == IP else mode)
@@ -195,23 +195,16 @@ class PowerStage:
         if self.state is PowerState.ENABLED and self._after_ramp is None:
             self._follow_halt(bool(controlword & HALT))
 
-    def _mode_is_due(self) -> bool:
-        """The new mode shows, after as long as this family takes."""
-        self._mode_due_ns = self._still_due_ns(self._mode_due_ns, self._manner.mode_change_s)
-        return self._mode_due_ns is None
-
-    def _power_is_due(self) -> bool:
-        self._enable_due_ns = self._still_due_ns(self._enable_due_ns, self._manner.power_on_s)
-        return self._enable_due_ns is None
-
-    def _still_due_ns(self, due_ns: int | None, takes_s: float) -> int | None:
-        """When it is due that begins now unless it has begun; None where that has come."""
-        if due_ns is None:
-            due_ns = self._axis.now_ns + round(takes_s * 1e9)
-        return None if self._axis.now_ns >= due_ns else due_ns
+    def _is_due(self, what: str) -> bool:
+        """As long after it was first asked for as this family takes; asked again, it begins anew."""
+        takes_s = self._manner.mode_change_s if what == "mode" else self._manner.power_on_s
+        due_ns = self._due_ns.setdefault(what, self._axis.now_ns + round(takes_s * 1e9))
+        if self._axis.now_ns >= due_ns:
+            del self._due_ns[what]
+        return what not in self._due_ns
 
     def _may(self, transition: int) -> bool:
-        if transition == 4 and self._manner.power_on_s and not self._power_is_due():
+        if transition == 4 and self._manner.power_on_s and not self._is_due("power"):
             return False
         if transition in (4, 16) and self._host_missing():
             return False  # no power while the host's heartbeat is missing

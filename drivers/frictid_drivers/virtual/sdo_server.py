@@ -16,18 +16,12 @@ _MAX_TRANSFER_BYTES = 1024
 
 
 @dataclass(slots=True)
-class _Upload:
+class _Transfer:
+    command: int  # of its segments: 3 uploads, 0 downloads
     address: Key
-    data: bytes
-    sent: int = 0
-    toggle: int = 0
-
-
-@dataclass(slots=True)
-class _Download:
-    address: Key
-    size: int | None
     data: bytearray
+    size: int | None = None  # of a download, where the client told it
+    sent: int = 0
     toggle: int = 0
 
 
@@ -36,7 +30,7 @@ class SdoServer:
 
     def __init__(self, dictionary: ObjectDictionary) -> None:
         self._dictionary = dictionary
-        self._transfer: _Upload | _Download | None = None
+        self._transfer: _Transfer | None = None
 
     def reset(self) -> None:
         """Forget the transfer under way."""
@@ -51,20 +45,20 @@ class SdoServer:
             self._transfer = None
             return None
         transfer = self._transfer
-        segment = command in (0, 3)
         address = request[2] << 16 | request[1] << 8 | request[3]
-        if segment and transfer is not None:
+        if command in (0, 3) and transfer is not None:
             address = transfer.address
         try:
             if command == 1:
                 return self._start_download(address, request)
             if command == 2:
                 return self._start_upload(address)
-            if command == 0 and isinstance(transfer, _Download):
-                return self._download_segment(transfer, request)
-            if command == 3 and isinstance(transfer, _Upload):
-                return self._upload_segment(transfer, request)
-            raise SdoAbort(Abort.UNKNOWN_COMMAND)
+            if transfer is None or transfer.command != command:
+                raise SdoAbort(Abort.UNKNOWN_COMMAND)
+            if request[0] >> 4 & 1 != transfer.toggle:
+                raise SdoAbort(Abort.TOGGLE_NOT_ALTERNATED)
+            transfer.toggle ^= 1
+            return self._upload_segment(transfer) if command == 3 else self._download_segment(transfer, request)
         except SdoAbort as abort:
             self._transfer = None
             return _frame(0x80, address, abort.code)
@@ -74,17 +68,14 @@ class SdoServer:
         data = self._dictionary.upload(address)
         if 0 < len(data) <= 4:
             return _frame(0x43 | (4 - len(data)) << 2, address, int.from_bytes(data, "little"))
-        self._transfer = _Upload(address, data)
+        self._transfer = _Transfer(3, address, bytearray(data))
         return _frame(0x41, address, len(data))
 
-    def _upload_segment(self, transfer: _Upload, request: bytes) -> bytes:
-        if request[0] >> 4 & 1 != transfer.toggle:
-            raise SdoAbort(Abort.TOGGLE_NOT_ALTERNATED)
+    def _upload_segment(self, transfer: _Transfer) -> bytes:
         piece = transfer.data[transfer.sent : transfer.sent + 7]
         transfer.sent += len(piece)
         last = transfer.sent >= len(transfer.data)
-        command = transfer.toggle << 4 | (7 - len(piece)) << 1 | last
-        transfer.toggle ^= 1
+        command = (transfer.toggle ^ 1) << 4 | (7 - len(piece)) << 1 | last
         if last:
             self._transfer = None
         return bytes([command]) + piece.ljust(7, b"\0")
@@ -101,27 +92,23 @@ class SdoServer:
             size_bytes = int.from_bytes(request[4:8], "little") if size_given else None
             if size_bytes is not None and size_bytes > _MAX_TRANSFER_BYTES:
                 raise SdoAbort(Abort.TOO_LONG)
-            self._transfer = _Download(address, size_bytes, bytearray())
+            self._transfer = _Transfer(0, address, bytearray(), size_bytes)
         return _frame(0x60, address, 0)
 
     def _size_of(self, address: Key) -> int:
         return min(4, len(self._dictionary.upload(address)) or 4)
 
-    def _download_segment(self, transfer: _Download, request: bytes) -> bytes:
-        if request[0] >> 4 & 1 != transfer.toggle:
-            raise SdoAbort(Abort.TOGGLE_NOT_ALTERNATED)
+    def _download_segment(self, transfer: _Transfer, request: bytes) -> bytes:
         transfer.data += request[1 : 8 - (request[0] >> 1 & 7)]
         limit = _MAX_TRANSFER_BYTES if transfer.size is None else transfer.size
         if len(transfer.data) > limit:
             raise SdoAbort(Abort.LENGTH_MISMATCH if transfer.size is not None else Abort.TOO_LONG)
-        reply = bytes([0x20 | transfer.toggle << 4]) + bytes(7)
-        transfer.toggle ^= 1
         if request[0] & 1:
             self._transfer = None
             if transfer.size is not None and len(transfer.data) != transfer.size:
                 raise SdoAbort(Abort.LENGTH_MISMATCH)
             self._dictionary.download(transfer.address, bytes(transfer.data))
-        return reply
+        return bytes([0x20 | (transfer.toggle ^ 1) << 4]) + bytes(7)
 
 
 def _frame(command: int, address: Key, value: int) -> bytes:

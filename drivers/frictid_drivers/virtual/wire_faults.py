@@ -62,7 +62,7 @@ class WireFaults:
             self._mapping.learn(can_id & ~FD_FRAME, data)
 
     def through(self, now_ns: int, elapsed_ns: float, can_id: int, data: bytes) -> list[Passed]:
-        """The frames that come out, each with its time on the caller's clock; ``elapsed_ns`` since SYNC, or -1."""
+        """What comes out, each frame with its time on the caller's clock; ``elapsed_ns`` since first SYNC, or -1."""
         plain = can_id & ~FD_FRAME
         if self._reports:
             self._mapping.learn(plain, data)
