@@ -38,7 +38,6 @@ REPORT_INTERVAL_S = 0.010  # a locked joint is seen to stand still at least this
 _SLOW_FACTOR = 6
 _MAX_TYPE = 240
 
-
 AVERAGE_LIMIT_PERCENT = 100.0 * BUSIEST
 """Above this on average, low-priority frames (heartbeats, SDO) starve and one retransmission breaks a cycle."""
 

@@ -28,7 +28,6 @@ from frictid_hil.protocol.driver import FD_FRAME, FrameSink
 # What it logs is told by our errors, with cause and next step; it must not reach stderr on its own.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
-
 _SDO_BYTES = 8
 
 

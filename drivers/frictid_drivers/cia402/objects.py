@@ -154,7 +154,6 @@ MODE_BITS = {7: 1 << 6, 8: 1 << 7, 9: 1 << 8, 10: 1 << 9}  # bit of 6502 for eac
 
 MILLI_RPM = 0xFDB44700  # 60A9: 10^-3 revolutions per minute, fine enough for friction work
 
-
 PDO_COB_ID, PDO_TYPE, RPDO_TIMEOUT, PDO_SYNC_START = 1, 2, 5, 6
 _PDO = {
     PDO_COB_ID: ("u32", "PDO COB-ID"),

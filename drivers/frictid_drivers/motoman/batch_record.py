@@ -74,7 +74,7 @@ class JobRecord:
         return self.count > before
 
     def complete(self, state: JobState, progress: Callable[[float], None]) -> None:
-        """Fetch what is missing of a job that is over; ``LinkError`` after several attempts, or ``BadReply``."""
+        """Fetch what is missing of a job that is over; ``LinkError`` after several attempts, ``BadReply`` for other."""
         self.dropped_pulses = state.dropped_pulses
         failures = 0
         while self.count < state.done_ticks:

@@ -33,7 +33,6 @@ _URGENT_S: Final = 0.5
 _LINK_CAUSE: Final = "wrong baud or parity, a broken cable, or a controller that is off"
 _LOOK_AT_LINE: Final = "check the cable, and `options.baud` and `options.parity` against RS030-RS033"
 
-
 Profile = tuple[tuple[str, ...], tuple[str, ...]]
 """What differs between controller generations: the meaning of bits 0.. of both figures of RSTATS; "" is unused."""
 

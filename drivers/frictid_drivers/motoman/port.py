@@ -17,7 +17,6 @@ from frictid_hil.errors import HardwareBusy, HardwareError
 _REOPEN_EVERY_S = 0.5
 _LOST = (serial.SerialException, OSError, termios.error)
 
-
 Sink = Callable[[bytes, bool], None]  # told of every portion of bytes on the wire, with True for ours
 
 
@@ -48,7 +47,7 @@ class BytePort(Protocol):
 
 
 class SerialPort:
-    """A port of this machine, held exclusively, its parity as told; ``HardwareBusy`` or ``HardwareError`` otherwise."""
+    """A port of this machine, held exclusively, parity never changed silently; ``HardwareBusy``, ``HardwareError``."""
 
     def __init__(self, path: str, baud: int, parity: str) -> None:
         self._path = path

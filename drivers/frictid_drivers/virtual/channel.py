@@ -56,7 +56,10 @@ def socket_path(channel: str) -> Path:
 
 
 def take(channel: str) -> filelock.BaseFileLock:
-    """Take the channel, and return its lock to release; ``HardwareBusy`` where it is taken, ``HardwareError`` else."""
+    """Take the channel for this process, and return its lock to release.
+
+    ``HardwareBusy`` where another process, or another driver of this one, has it; ``HardwareError`` without its file.
+    """
     path = runtime_folder() / f"{channel}.lock"
     lock = filelock.FileLock(path, timeout=0)
     try:

@@ -21,7 +21,10 @@ _TORQUE_MODE = 10
 
 
 def plant_for(robot: RobotSetup, joint: JointSetup, period_s: float = CONTROL_PERIOD_S) -> ServoLoop:
-    """The simulated joint under inner loops, where the robot file locks it; ``InvalidFields`` by ``simulated``."""
+    """The simulated joint under inner loops, where the robot file locks it, its noise by the robot's seed.
+
+    ``InvalidFields`` where the joint's ``simulated`` mapping is wrong.
+    """
     return ServoLoop(
         JointModel.of(joint, joint.name),
         period_s=period_s,

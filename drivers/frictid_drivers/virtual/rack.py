@@ -24,7 +24,6 @@ Handler = Callable[[bytes, int], None]
 
 SYNC_GAP_TENTHS = 20  # 2010h:01 in lock-step: drives alarm when a SYNC is more than twice its period late
 
-
 _WARM_UP_NS = 1_000_000
 
 

@@ -24,7 +24,7 @@ Line = tuple[int, str]  # speed and parity
 
 
 class Emulator:
-    """The arm stands unpowered; ``on_guided`` is told when an axis is given into a person's hands, and taken back."""
+    """The controller, its arm unpowered; ``on_guided`` is told when a person takes an axis by hand, and lets go."""
 
     def __init__(
         self,
