@@ -72,7 +72,7 @@ class StreamSession:
         return 0 if self._reports else round((self._port.now_s() - self._arrived_s) * 1e9)
 
     def begin(self, session: int, axis_mask: int) -> None:
-        """Say HELLO until the controller answers; ``LinkError`` where it does not, ``HardwareError`` where it cannot."""
+        """Say HELLO until the controller answers; ``LinkError`` without an answer, ``HardwareError`` for an odd one."""
         self._session = session
         until_s = self._port.now_s() + _HELLO_FOR_S
         while self._port.now_s() < until_s:

@@ -29,7 +29,7 @@ _DEFAULTS: Mapping[str, float | bool] = {
 
 
 def build(setup: RobotSetup, faults: FaultPlan | None = None) -> Emulator:
-    """This robot's controller, arm at its locked positions, servo power off; ``InvalidFields`` where it cannot be so."""
+    """This robot's controller, arm at its locked positions, servo power off; ``InvalidFields`` where there is none."""
     options = _options(setup.options.get("emulator", {}))
     settings = _settings(setup, options)
     joints = [joint for _, joint in sorted({joint.address: joint for joint in setup.joints}.items())]
