@@ -12,7 +12,7 @@ from frictid_drivers.motoman.emulator.axis import Axis, Plate
 from frictid_drivers.motoman.emulator.faults import Fault, FaultPlan
 from frictid_drivers.motoman.emulator.loopback import LoopbackPort
 from frictid_drivers.motoman.emulator.machine import Emulator
-from frictid_drivers.motoman.emulator.settings import Settings
+from frictid_drivers.motoman.emulator.panel import Settings
 from frictid_drivers.motoman.host_control import PROFILES, HostControl
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.setup import JointSetup, RobotSetup

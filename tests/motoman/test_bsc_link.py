@@ -21,7 +21,7 @@ from frictid_drivers.motoman.bsc import (
     decode_block,
     encode_blocks,
 )
-from frictid_drivers.motoman.emulator.settings import Settings
+from frictid_drivers.motoman.emulator.panel import Settings
 from frictid_drivers.motoman.emulator.station import Station, _pieces, _read
 
 GOLDEN = {

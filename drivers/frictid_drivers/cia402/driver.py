@@ -16,7 +16,7 @@ from frictid_drivers.cia402.axis import Axis
 from frictid_drivers.cia402.codec import Decoder
 from frictid_drivers.cia402.cycle import Cycle
 from frictid_drivers.cia402.fleet import NMT_PRE_OPERATIONAL, NMT_START, Fleet
-from frictid_drivers.cia402.frame_map import FrameMap, JointFrames
+from frictid_drivers.cia402.frame_map import FrameMap
 from frictid_drivers.cia402.layout import Layout
 from frictid_drivers.cia402.network import HeartbeatTimer
 from frictid_drivers.cia402.settings import read_settings
@@ -163,7 +163,16 @@ class Cia402Driver:
         self._layout = layout
         self._decoder = Decoder(self._frame_map, layout.active)
         self._axes = {
-            frames.name: self._axis(frames, feedback, fleet, cycle_hz)
+            frames.name: Axis(
+                frames,
+                fleet.scale_of(frames.name),
+                feedback,
+                max_torque_nm=self._torque_limits_nm[frames.name],
+                standstill_rad_s=self._joint_settings[frames.name].standstill_rad_s,
+                reset_cycles=max(3, math.ceil(_RESET_S * cycle_hz)),
+                position_mode=fleet.facts[frames.name].position_mode,
+                mode_when_enabled=fleet.drives[frames.name].quirks.mode_when_enabled,
+            )
             for frames, feedback in zip(self._frame_map.joints, self._decoder.feedback, strict=True)
         }
         # The drives watch over us from now on: be heard, also while nobody cycles.
@@ -338,19 +347,6 @@ class Cia402Driver:
         if name not in self._axes:
             raise HardwareError("not configured yet", where=f"joint {name}")
         return self._axes[name]
-
-    def _axis(self, frames: JointFrames, feedback: Feedback, fleet: Fleet, cycle_hz: float) -> Axis:
-        name = frames.name
-        return Axis(
-            frames,
-            fleet.scale_of(name),
-            feedback,
-            max_torque_nm=self._torque_limits_nm[name],
-            standstill_rad_s=self._joint_settings[name].standstill_rad_s,
-            reset_cycles=max(3, math.ceil(_RESET_S * cycle_hz)),
-            position_mode=fleet.facts[name].position_mode,
-            mode_when_enabled=fleet.drives[name].quirks.mode_when_enabled,
-        )
 
     def _resume_heartbeat(self) -> None:
         """In lock-step time stands still outside the cycle, and nobody misses us."""

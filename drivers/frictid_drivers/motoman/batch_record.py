@@ -35,10 +35,7 @@ Rows = dict[int, tuple[int, int, int]]
 
 
 class JobRecord:
-    """The samples of one job that are here so far.
-
-    ``arrived`` is told the numbers [first, last) of samples that joined those that are here without a gap.
-    """
+    """The samples of one job that are here so far."""
 
     def __init__(
         self,
@@ -46,6 +43,7 @@ class JobRecord:
         number: int,
         *,
         while_running: bool,
+        # Told the numbers [first, last) of samples that joined those that are here without a gap.
         arrived: Callable[[int, int], None] = lambda first, last: None,
     ) -> None:
         self._host = host

@@ -9,7 +9,7 @@ from typing import Any
 from frictid_drivers.motoman.emulator.axis import Axis, Plate
 from frictid_drivers.motoman.emulator.faults import FaultPlan
 from frictid_drivers.motoman.emulator.machine import Emulator
-from frictid_drivers.motoman.emulator.settings import Settings
+from frictid_drivers.motoman.emulator.panel import Settings
 from frictid_drivers.virtual.devices import plant_for
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup, RobotSetup

@@ -13,8 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from frictid_drivers.motoman.emulator.axis import Axis
 from frictid_drivers.motoman.emulator.faults import Fault, FaultPlan
 from frictid_drivers.motoman.emulator.jobs import BatchApplication
-from frictid_drivers.motoman.emulator.panel import DONE, Panel, Refused, Reply, require
-from frictid_drivers.motoman.emulator.settings import Settings
+from frictid_drivers.motoman.emulator.panel import DONE, Panel, Refused, Reply, Settings, require
 from frictid_drivers.motoman.emulator.station import Station
 from frictid_drivers.motoman.emulator.streaming import StreamApplication
 

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Generator
 from typing import Protocol
 
-from frictid_drivers.motoman.emulator.settings import Settings
+from frictid_drivers.motoman.emulator.panel import Settings
 
 _CUT = 256
 
