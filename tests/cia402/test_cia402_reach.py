@@ -116,6 +116,15 @@ def test_a_silent_drive_is_named():
     assert b.bus.closed
 
 
+@pytest.mark.parametrize("size", [0, 1, 3, 7])
+def test_a_refusal_that_is_cut_short_is_named(size, monkeypatch):
+    """canopen looked for its code behind the end of the frame, which ended in a traceback."""
+    drive = ScriptedDrive(1)
+    monkeypatch.setattr(drive, "sdo", lambda request: ScriptedDrive.abort(0x1000, 0, 0x06020000)[:size])
+    with pytest.raises(HardwareError, match=f"an answer of {size} bytes instead of 8"):
+        Bench(drive, options={"sdo_timeout_s": 0.02}).open()
+
+
 def test_a_bus_that_is_not_there():
     with pytest.raises(HardwareError) as caught:
         Cia402Driver(robot(1).__class__("r", "socketcan:no_such_can", 1000.0, robot(1).joints)).open()

@@ -115,10 +115,10 @@ class InlineSdoClient(SdoClient):
             remaining = deadline - time.monotonic()
             if remaining <= 0 or (not self.network.pump(remaining) and time.monotonic() >= deadline):
                 raise SdoCommunicationError("No SDO response received")
-        answer = super().read_response()  # type: ignore[no-untyped-call]  # canopen is only partly typed
-        if len(answer) != _SDO_BYTES:
-            raise SdoCommunicationError(f"an answer of {len(answer)} bytes instead of {_SDO_BYTES}")
-        return answer
+        if len(self.responses.queue[0]) != _SDO_BYTES:  # canopen would look for the code of a refusal behind its end
+            short = self.responses.get_nowait()
+            raise SdoCommunicationError(f"an answer of {len(short)} bytes instead of {_SDO_BYTES}")
+        return super().read_response()  # type: ignore[no-untyped-call]  # canopen is only partly typed
 
 
 class Node(canopen.RemoteNode):
