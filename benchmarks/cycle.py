@@ -178,10 +178,10 @@ class OurDrives:
             )
             for number, (name, pdos) in enumerate(layout.pdos.items())
         )  # fmt: skip
-        frame_map = FrameMap(joints)
+        settings, _ = read_settings(RobotSetup("cycle", f"frictid:{channel}", cycle_hz, ()))
+        frame_map = FrameMap(joints, window_ns=round(settings.reply_window * 1e9 / cycle_hz))
         decoder = Decoder(frame_map, layout.active)
         axes = [self._axis(joint, scale, at) for joint, at in zip(joints, decoder.feedback, strict=True)]
-        settings, _ = read_settings(RobotSetup("cycle", f"frictid:{channel}", cycle_hz, ()))
         self._cycle = Cycle(
             self.bus, self.clock, self._keep, frame_map, layout, axes, decoder, settings,
             other=lambda *frame: None,
