@@ -151,6 +151,21 @@ def test_asymmetry_is_even_and_leaves_the_odd_curve_alone() -> None:
     np.testing.assert_allclose(true_curve_nm(model, v), true_curve_nm(bare(), v))
 
 
+def test_asymmetry_with_an_onset_is_there_in_motion_only() -> None:
+    """A joint that is pushed across its level: the even part holds it at rest, or is gone there."""
+    rest, speed = [], []
+    for onset in (0.0, 0.02):
+        asymmetry = {"coulomb_share": 0.2, "onset_rad_s": onset}
+        model = bare(effects={"direction_asymmetry": asymmetry}, friction={"coulomb_nm": COULOMB}, **LEVEL)
+        _, rows = drive(model, lambda t: 0.95 * COULOMB * min(t, 1.0), 3.0)
+        rest.append(rows.position_rad[-500:].mean())
+        v = np.array([0.5, -0.5])
+        speed.append(steady_friction_nm(model, v))
+    # Wound up to a slip of s, the spring and the part that stays make 0.95 = s + 0.2 s; without it s is 0.95.
+    np.testing.assert_allclose(rest, [0.95 / 1.2 * COULOMB / STIFFNESS, 0.95 * COULOMB / STIFFNESS], rtol=0.03)
+    np.testing.assert_allclose(speed, [[1.2 * COULOMB, -0.8 * COULOMB]] * 2)
+
+
 def test_load_raises_friction_where_gravity_is_large() -> None:
     model = bare(effects={"load_dependent_friction": {"linear_share": 0.2, "quadratic_per_nm": 0.01}})
     v = np.array([0.5])
