@@ -186,7 +186,8 @@ class Axis:
 
     def _goes_on(self, set_point: SetPoint) -> bool:
         """The same status as when it followed a position in the last cycle: only place and torque are new."""
-        offset = self._torque(set_point.torque_offset_nm)
+        torque_nm = set_point.torque_offset_nm
+        offset = self._torque(torque_nm) if torque_nm else 0
         if self.feedback.mode is not Mode.POSITION or self._secondary_told is None or offset != self._secondary_told[0]:
             self._following_status = _NEVER
             return False

@@ -81,6 +81,8 @@ class _Report:
             frame.meanings.index(meaning) if meaning in frame.meanings else -1
             for meaning in (STATUS, MODE_SHOWN, ERROR, INPUTS)
         )
+        told = (self.status_at, self.mode_at, self.error_at, self.inputs_at)
+        self.figures_only = not self.slow and max(told) < 0
         self.figures = tuple(
             (at, _ATTRIBUTES[meaning], float(getattr(joint, FIGURES[meaning])))
             for at, meaning in enumerate(frame.meanings)
@@ -102,6 +104,17 @@ class _Joint:
     told: int = 0
     emergency: int = 0
     untold: int = 0
+
+    def take(self) -> None:
+        """All cyclic reports of one SYNC are there: they are the joint's figures now."""
+        feedback, first = self.feedback, self.cyclic[0]
+        self.taken_cycle = first.cycle
+        feedback.t_ns = first.t_ns
+        feedback.valid = True
+        for report in self.cyclic:
+            values = report.values
+            for at, attribute, factor in report.figures:
+                setattr(feedback, attribute, values[at] * factor)
 
     def judge(self) -> None:
         """What is wrong now: an emergency not taken back, or 603F in fault (else it is history, at some vendors)."""
@@ -173,6 +186,8 @@ class Decoder:
             report.t_ns = self._t_ns
             if report.awaited:
                 self.missing -= 1
+        if report.figures_only:
+            return True
         if report.status_at >= 0:
             status = feedback.status_raw = values[report.status_at]
             feedback.state = JOINT_STATES[status & 0x6F]
@@ -204,14 +219,12 @@ class Decoder:
             feedback = joint.feedback
             cyclic = joint.cyclic
             newest = cyclic[0].cycle if cyclic else -1
-            if newest > joint.taken_cycle and all(report.cycle == newest for report in cyclic):
-                joint.taken_cycle = newest
-                feedback.t_ns = cyclic[0].t_ns
-                feedback.valid = True
+            if newest > joint.taken_cycle:
                 for report in cyclic:
-                    values = report.values
-                    for at, attribute, factor in report.figures:
-                        setattr(feedback, attribute, values[at] * factor)
+                    if report.cycle != newest:
+                        break
+                else:
+                    joint.take()
             feedback.age_cycles = cycle - joint.taken_cycle
             if joint.untold:
                 # An emergency is shown in its row, whatever 603F or the next emergency said right after it.
