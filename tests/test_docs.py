@@ -5,16 +5,21 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 import frictid_drivers
 import frictid_hil
 from frictid_drivers import stop_paths
+from frictid_drivers.cia402 import settings as cia402
+from frictid_drivers.mit import settings as mit
+from frictid_drivers.servos import settings as servos
 from frictid_hil.config import reference
 from frictid_hil.config.columns import load_columns
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.search import find
+from frictid_hil.protocol.can_bus import FORWARDED
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")})
@@ -101,6 +106,19 @@ def test_the_page_of_verbs_is_that_of_the_command_line() -> None:
 def test_the_page_of_stops_is_that_of_the_code() -> None:
     page = (ROOT / "docs" / "reference" / "stops.md").read_text(encoding="utf-8")
     assert page == stop_paths.page(), "python -m frictid_drivers.stop_paths docs/reference/stops.md"
+
+
+@pytest.mark.parametrize(
+    ("page", "settings", "elsewhere"),
+    [
+        ("reference/canopen-settings.md", cia402, {"faults"}),  # of a bus that injects faults: no setting of a drive
+        ("guides/mit-actuators.md", mit, {"reply_window", "torque_delay_s", *FORWARDED}),  # as of CANopen
+        ("guides/servos.md", servos, set()),
+    ],
+)
+def test_the_page_of_a_driver_names_every_option(page: str, settings: ModuleType, elsewhere: set[str]) -> None:
+    told = set(re.findall(r"\w+", (ROOT / "docs" / page).read_text(encoding="utf-8")))
+    assert (settings.BUS_OPTIONS | settings.JOINT_OPTIONS) - told <= elsewhere
 
 
 @pytest.mark.parametrize("name", ["fault-findings.csv", "drive-findings.csv"])
