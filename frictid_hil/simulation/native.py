@@ -182,7 +182,7 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
 
 _PLASTIC = "a spring that yields: where you set qpos by hand or by a keyframe, set data.plastic to the same"
 _FRICTION_LOSES = {
-    "direction_asymmetry": "asymmetry that grows with speed: only its mean is written",
+    "direction_asymmetry": "asymmetry that changes with speed or ends at rest: only its mean is written",
     "load_dependent_friction": "the load: friction of the recordings' mean load is written",
     "directional_efficiency": "the load: friction of the recordings' mean load is written",
     "presliding_hysteresis": "the rounded loop: an elasto-plastic element of the same travel is written",
