@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from sim_joints import CONTROLLER, COULOMB, GRAVITY, INERTIA, STIFFNESS, VISCOUS, bare, excitation, simulate
 
+from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import HandImpedance
 from frictid_hil.simulation.replay import Controller, closed_loop, open_loop
 from frictid_hil.simulation.servo_loop import ServoLoop
@@ -164,6 +166,16 @@ def test_asymmetry_with_an_onset_is_there_in_motion_only() -> None:
     # Wound up to a slip of s, the spring and the part that stays make 0.95 = s + 0.2 s; without it s is 0.95.
     np.testing.assert_allclose(rest, [0.95 / 1.2 * COULOMB / STIFFNESS, 0.95 * COULOMB / STIFFNESS], rtol=0.03)
     np.testing.assert_allclose(speed, [[1.2 * COULOMB, -0.8 * COULOMB]] * 2)
+
+
+def test_onsets_that_are_tried_are_ones_that_a_file_may_say() -> None:
+    effect = all_effects()["direction_asymmetry"]
+    assert effect.inverse is not None
+    onset = next(p for p in effect.parameters if p.name == "onset_rad_s")
+    for top_rad_s in (0.0, 1.0, 500.0):  # at rest, a joint, a motor on a stand
+        shapes = effect.inverse.grid_for([SimpleNamespace(velocity_rad_s=np.array([0.0, -top_rad_s]))])
+        tried = [shape["onset_rad_s"] for shape in shapes]
+        assert tried[0] == 0.0 and tried == sorted(set(tried)) and tried[-1] <= onset.upper
 
 
 def test_load_raises_friction_where_gravity_is_large() -> None:

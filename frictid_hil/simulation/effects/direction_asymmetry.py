@@ -12,6 +12,7 @@ from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, P
 from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
 ONSETS = (0.0, 0.005, 0.03, 0.15)  # of the top speed; the data choose, and a replay refines
+LARGEST_ONSET_RAD_S = 5.0
 
 
 def friction(
@@ -34,18 +35,24 @@ def friction(
 def shapes_for(views: Sequence[View]) -> tuple[Shape, ...]:
     """Onsets from none to a good part of the speeds of these recordings."""
     top = max((float(np.max(np.abs(v.velocity_rad_s))) for v in views), default=0.0)
-    return tuple({"onset_rad_s": share * top} for share in (ONSETS if top > 0.0 else ONSETS[:1]))
+    onsets = sorted({min(share * top, LARGEST_ONSET_RAD_S) for share in ONSETS})
+    return tuple({"onset_rad_s": onset} for onset in onsets)
 
 
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """The even parts of level and rate along each view, (n, 2), per share."""
-    return [np.stack([v.coulomb_nm * _there(v, shape["onset_rad_s"]), np.abs(v.rate_nm)], axis=1) for v in views]
+    return [
+        np.stack(
+            [v.coulomb_nm * _there(v.slip, v.velocity_rad_s, shape["onset_rad_s"]), np.abs(v.rate_nm)],
+            axis=1,
+        )
+        for v in views
+    ]
 
 
-def _there(v: View, onset_rad_s: float) -> Array:
-    if onset_rad_s <= 0.0:
-        return np.abs(v.slip)
-    return np.tanh(np.abs(v.velocity_rad_s) / onset_rad_s)
+def _there(slip: Array, velocity_rad_s: Array, onset_rad_s: float) -> Array:
+    """How much of the level's part is there, 0 to 1."""
+    return np.tanh(np.abs(velocity_rad_s) / onset_rad_s) if onset_rad_s > 0.0 else np.abs(slip)
 
 
 EFFECT = Effect(
@@ -64,7 +71,13 @@ EFFECT = Effect(
     parameters=(
         Parameter("coulomb_share", -0.5, 0.5, 0.05, "half difference of the sliding level, fraction", off=0.0),
         Parameter("viscous_share", -0.5, 0.5, 0.05, "half difference of the rate part, fraction", off=0.0),
-        Parameter("onset_rad_s", 0.0, 5.0, 0.0, "speed over which the level's part sets in; 0: it stays at rest"),
+        Parameter(
+            "onset_rad_s",
+            0.0,
+            LARGEST_ONSET_RAD_S,
+            0.0,
+            "speed over which the level's part sets in; 0: it stays at rest",
+        ),
     ),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
     hooks=(Hook("friction", friction),),
@@ -75,7 +88,10 @@ EFFECT = Effect(
         {
             "symmetric": lambda v: np.sign(v) + v,
             "with": lambda v: (
-                np.sign(v) + v + (p["coulomb_share"] * np.sign(np.abs(v)) + p["viscous_share"] * np.abs(v))
+                np.sign(v)
+                + v
+                + p["coulomb_share"] * _there(np.sign(v), v, p["onset_rad_s"])
+                + p["viscous_share"] * np.abs(v)
             ),
         },
     ),
