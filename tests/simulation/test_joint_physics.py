@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -173,7 +174,8 @@ def test_onsets_that_are_tried_are_ones_that_a_file_may_say() -> None:
     assert effect.inverse is not None
     onset = next(p for p in effect.parameters if p.name == "onset_rad_s")
     for top_rad_s in (0.0, 1.0, 500.0):  # at rest, a joint, a motor on a stand
-        shapes = effect.inverse.grid_for([SimpleNamespace(velocity_rad_s=np.array([0.0, -top_rad_s]))])
+        views: list[Any] = [SimpleNamespace(velocity_rad_s=np.array([0.0, -top_rad_s]))]
+        shapes = effect.inverse.grid_for(views)
         tried = [shape["onset_rad_s"] for shape in shapes]
         assert tried[0] == 0.0 and tried == sorted(set(tried)) and tried[-1] <= onset.upper
 
