@@ -56,6 +56,7 @@ from frictid_hil.protocol.driver import Feedback, JointState, SetPoint, WallCloc
 from frictid_hil.runner.cycle import CyclicLoop
 from frictid_hil.runner.realtime import make_punctual
 from frictid_hil.runner.ring import frame_ring, sample_ring
+from frictid_hil.runner.scheduler import Recorder
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
 
 RATES_HZ, ACTIVE = (250, 500, 1000), (1, 6, 12)
@@ -182,8 +183,9 @@ class OurDrives:
         frame_map = FrameMap(joints, window_ns=round(settings.reply_window * 1e9 / cycle_hz))
         decoder = Decoder(frame_map, layout.active)
         axes = [self._axis(joint, scale, at) for joint, at in zip(joints, decoder.feedback, strict=True)]
+        recorder = Recorder(sample_ring(), self.frames)
         self._cycle = Cycle(
-            self.bus, self.clock, self._keep, frame_map, layout, axes, decoder, settings,
+            self.bus, self.clock, recorder, frame_map, layout, axes, decoder, settings,
             other=lambda *frame: None,
         )  # fmt: skip
         self.exchange = self._cycle.exchange
@@ -193,9 +195,6 @@ class OurDrives:
     @staticmethod
     def _axis(joint: JointFrames, scale: Scale, feedback: Feedback) -> Axis:
         return Axis(joint, scale, feedback, max_torque_nm=10.0, standstill_rad_s=0.02, reset_cycles=100)
-
-    def _keep(self, t_ns: int, can_id: int, data: bytes, sent: bool) -> None:
-        self.frames.append(t_ns, can_id, len(data), sent, 0, data)
 
 
 class BareWire:

@@ -25,8 +25,8 @@ from can.interfaces.socketcan import SocketcanBus
 
 from frictid_hil.protocol.driver import EXTENDED, FD_FRAME
 
-Heard = tuple[int, bytes, float]
-"""Identifier, data, and when it came, s of python-can's time stamps."""
+Heard = tuple[int, bytes]
+"""Identifier and data."""
 
 BUS_OFF = "bus-off"
 _PASSIVE, _ALONE = "error-passive", "no acknowledgement"
@@ -113,7 +113,7 @@ class MessageFrames:
             if message.is_error_frame:
                 self.controller = controller_state(message.arbitration_id, message.data) or self.controller
             elif not message.is_extended_id and not message.is_remote_frame:
-                heard.append((identifier_of(message), bytes(message.data), message.timestamp))
+                heard.append((identifier_of(message), bytes(message.data)))
             message = self._bus.recv(0.0)
         return heard
 
@@ -200,7 +200,6 @@ class SocketFrames:
         self._classical = self._packing[False].size
         self._packets = struct.Struct("<IB3x64s8x" if stamped else "<IB3x64s")
         self._out, self._in = _Packets(self._stride), _Packets(self._stride)
-        self._arrived = memoryview(self._in.room)
         # These calls never wait, so that the interpreter's lock need not be let go.
         library = ctypes.PyDLL(None, use_errno=True)
         self._sendmmsg, self._recvmmsg = library.sendmmsg, library.recvmmsg
@@ -217,20 +216,24 @@ class SocketFrames:
             self.send(frames[:MOST])
             self.send(frames[MOST:])
             return
-        room, sizes, stride = self._out.room, self._out.sizes, self._stride
+        room, sizes, at = self._out.room, self._out.sizes, 0
         stamp = (time.monotonic_ns(),) if self._stamped else ()
-        for at, (can_id, data) in enumerate(frames):
-            fd = can_id & FD_FRAME != 0
-            packing = self._packing[fd]
-            packing.pack_into(room, at * stride, can_id & ~FD_FRAME, len(data), fd and _BIT_RATE_SWITCH, data, *stamp)
-            sizes[at] = packing.size
-        done, first = 0, self._first
-        while done < len(frames):
-            sent = self._sendmmsg(self._whose, first, self._counts[len(frames) - done], self._at_once)
+        classical, size = self._packing[False].pack_into, self._classical
+        for number, (can_id, data) in enumerate(frames):
+            if can_id & FD_FRAME:
+                packing = self._packing[True]
+                packing.pack_into(room, at, can_id & ~FD_FRAME, len(data), _BIT_RATE_SWITCH, data, *stamp)
+                sizes[number] = packing.size
+            else:
+                classical(room, at, can_id, len(data), 0, data, *stamp)
+                sizes[number] = size
+            at += self._stride
+        left, first = len(frames), self._first
+        while (sent := self._sendmmsg(self._whose, first, self._counts[left], self._at_once)) != left:
             if sent < 0:
                 raise _failed()
-            done += sent
-            first = ctypes.c_void_p(self._out.address + done * ctypes.sizeof(_Message))
+            left -= sent
+            first = ctypes.c_void_p(self._out.address + (len(frames) - left) * ctypes.sizeof(_Message))
 
     def send_alone(self, can_id: int, data: bytes) -> None:
         """Send one, from any thread."""
@@ -248,20 +251,23 @@ class SocketFrames:
             count = self._recvmmsg(*self._into)
         if count < 0:
             raise _failed()
-        now_s = time.time()
         heard: list[Heard] = []
-        packets = self._packets.iter_unpack(self._arrived[: count * self._stride])
-        for length, (can_id, size, data) in zip(self._in.lengths[:count], packets, strict=True):
-            if length < self._classical:
+        unpack, room, lengths, classical = self._packets.unpack_from, self._in.room, self._in.lengths, self._classical
+        for at in range(count):
+            length = lengths[at]
+            can_id, size, data = unpack(room, at * self._stride)
+            if length == classical and can_id <= 0x7FF and size <= 8:
+                heard.append((can_id, data[:size]))
+            elif length < classical:
                 raise ConnectionResetError(errno.ECONNRESET, "the bus is gone: whoever kept it has ended")
-            if can_id & _ERROR_FRAME:
+            elif can_id & _ERROR_FRAME:
                 self.controller = controller_state(can_id, data) or self.controller
             elif not can_id & _NOT_OURS:
-                if length > self._classical:
+                if length > classical:
                     can_id |= FD_FRAME
                 elif size > 8:
                     size = 8
-                heard.append((can_id, data[:size], now_s))
+                heard.append((can_id, data[:size]))
         return heard
 
 

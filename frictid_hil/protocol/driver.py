@@ -196,6 +196,22 @@ FD_FRAME = 1 << 29
 FrameSink = Callable[[int, int, bytes, bool], None]
 """Called for every frame on the wire: run time in ns, CAN id (bit 31 set: extended, bit 29: CAN FD), data, True when we
 sent it."""
+FramesSink = Callable[[int, Sequence[tuple[int, bytes]], bool], None]
+"""The same for all frames of one moment: run time in ns, identifiers and data, True when we sent them."""
+
+
+def by_the_batch(sink: FrameSink | None) -> FramesSink:
+    """A sink's own way to take the frames of one moment together, its attribute ``batch``; else one by one."""
+    if sink is None:
+        return lambda t_ns, frames, sent: None
+    one = sink
+
+    def each(t_ns: int, frames: Sequence[tuple[int, bytes]], sent: bool) -> None:
+        for can_id, data in frames:
+            one(t_ns, can_id, data, sent)
+
+    own: FramesSink | None = getattr(sink, "batch", None)
+    return own or each
 
 
 class Clock(Protocol):

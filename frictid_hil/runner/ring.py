@@ -20,9 +20,10 @@ from __future__ import annotations
 import mmap
 import struct
 import zlib
+from collections.abc import Sequence
 from multiprocessing import shared_memory
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,7 +162,7 @@ class Ring:
                 break
         return np.concatenate(copies) if copies else rows[:0].copy()
 
-    def __enter__(self) -> Ring:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -183,11 +184,34 @@ class Ring:
             own.unlink()
 
 
+class FrameRing(Ring):
+    """A ring of ``FRAME_ROW``."""
+
+    def extend(self, t_ns: int, frames: Sequence[tuple[int, bytes]], sent: bool) -> None:
+        """Pack the frames of one moment (identifier, data), as ``append`` does one."""
+        head, count, capacity = self._head, len(frames), self._capacity
+        slot, last = head % capacity, head + count
+        if slot + count > capacity or last - self._counters[_TAIL] > capacity:
+            for can_id, data in frames:
+                self.append(t_ns, can_id, len(data), sent, 0, data)
+            return
+        buffer, pack_into, size = self._buffer, self._pack_into, self._row_bytes
+        at = first = _HEADER_BYTES + slot * size
+        for can_id, data in frames:
+            pack_into(buffer, at, t_ns, can_id, len(data), sent, 0, data)
+            at += size
+        self._head = last
+        if self._checked:
+            for number in range(count):
+                at = first + number * size
+                self._checks[slot + number] = zlib.crc32(buffer[at : at + size], (head + number + 1) & _WORD)
+
+
 def sample_ring(capacity: int = 1 << 16, *, shared: bool = False, name: str | None = None) -> Ring:
     """A ring of ``SAMPLE_ROW``; the default holds a minute of one joint at 1 kHz."""
     return Ring(SAMPLE_ROW, PACK_SAMPLE, capacity, shared=shared, name=name)
 
 
-def frame_ring(capacity: int = 1 << 18, *, shared: bool = False, name: str | None = None) -> Ring:
+def frame_ring(capacity: int = 1 << 18, *, shared: bool = False, name: str | None = None) -> FrameRing:
     """A ring of ``FRAME_ROW``; the default holds half a minute of a 1 kHz bus."""
-    return Ring(FRAME_ROW, PACK_FRAME, capacity, shared=shared, name=name)
+    return FrameRing(FRAME_ROW, PACK_FRAME, capacity, shared=shared, name=name)

@@ -33,7 +33,7 @@ from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import GO_ON, CyclicLoop, StopRequest
 from frictid_hil.runner.events import Configured, Event, JointRun, PhaseStarted, Preflight, Warned
 from frictid_hil.runner.motions import Motions
-from frictid_hil.runner.ring import Ring
+from frictid_hil.runner.ring import FrameRing, Ring
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
 from frictid_hil.runner.unit_proof import PROOF
 from frictid_hil.runner.workspace_watch import WorkspaceWatch
@@ -47,12 +47,16 @@ class Recorder:
     """The two rings, and the run time that goes on from one stretch of cyclic traffic to the next."""
 
     samples: Ring
-    frames: Ring
+    frames: FrameRing
     offset_ns: int = 0
 
-    def frame(self, t_ns: int, can_id: int, data: bytes, sent: bool) -> None:
+    def __call__(self, t_ns: int, can_id: int, data: bytes, sent: bool) -> None:
         """A frame on the wire (``driver.FrameSink``)."""
         self.frames.append(t_ns + self.offset_ns, can_id, len(data), sent, 0, data)
+
+    def batch(self, t_ns: int, frames: Sequence[tuple[int, bytes]], sent: bool) -> None:
+        """Frames of one moment (``driver.FramesSink``)."""
+        self.frames.extend(t_ns + self.offset_ns, frames, sent)
 
 
 @dataclass
@@ -87,7 +91,7 @@ class Scheduler:
         """
         first: FrictidError | None = None
         try:
-            self.driver.open(self.recorder.frame)
+            self.driver.open(self.recorder)
             preflight = self._preflight()
             self.notify(preflight)
             if not self.proceed(preflight):

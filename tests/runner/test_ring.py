@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from frictid_hil.errors import UsageError
+from frictid_hil.protocol.driver import by_the_batch
 from frictid_hil.runner.ring import FRAME_ROW, PACK_FRAME, PACK_SAMPLE, SAMPLE_ROW, Ring, frame_ring, sample_ring
+from frictid_hil.runner.scheduler import Recorder
 from frictid_hil.runs import run
 
 
@@ -114,6 +116,41 @@ def test_frames_keep_their_bytes() -> None:
     assert (int(row["can_id"]), int(row["length"]), int(row["sent"])) == (0x181, 3, 1)
     assert bytes(row["data"])[:3] == b"\x01\x02\x03"
     assert np.dtype(FRAME_ROW).itemsize == 80
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_frames_by_the_batch_are_what_they_are_one_by_one(shared: bool) -> None:
+    """Across the wrap, and where only some of a batch find room."""
+    with frame_ring(8, shared=shared) as batches, frame_ring(8, shared=shared) as singles:
+        for t_ns, count, drain in (
+            (1, 3, True),
+            (2, 3, False),
+            (3, 3, True),
+            (4, 5, False),
+            (5, 5, True),
+            (6, 0, True),
+        ):
+            frames = [(0x180 + number, bytes(range(number))) for number in range(count)]
+            batches.extend(t_ns, frames, sent=t_ns % 2 == 0)
+            for can_id, data in frames:
+                singles.append(t_ns, can_id, len(data), t_ns % 2 == 0, 0, data)
+            if drain:
+                assert batches.drain().tobytes() == singles.drain().tobytes()
+        assert batches.dropped == singles.dropped == 2
+        assert batches.drained == singles.drained == 17
+
+
+def test_a_sink_without_a_way_for_batches_hears_frame_by_frame() -> None:
+    heard: list[tuple[int, int, bytes, bool]] = []
+    by_the_batch(lambda *frame: heard.append(frame))(7, [(1, b"a"), (2, b"")], True)
+    assert heard == [(7, 1, b"a", True), (7, 2, b"", True)]
+    recorder = Recorder(sample_ring(4), frame_ring(4), offset_ns=100)
+    by_the_batch(recorder)(7, [(1, b"a")], True)
+    recorder(8, 2, b"b", False)
+    assert [(int(row["t_ns"]), int(row["can_id"]), int(row["sent"])) for row in recorder.frames.drain()] == [
+        (107, 1, 1), (108, 2, 0),
+    ]  # fmt: skip
+    by_the_batch(None)(7, [(1, b"a")], True)
 
 
 APPEND_MANY = """

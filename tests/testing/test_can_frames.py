@@ -48,7 +48,7 @@ def test_what_has_come_comes_at_once_and_in_order(joined):
     for sent in (packet(0x181, b"12345678"), packet(0x182, b"x" * 20, room=64), packet(0x701, b"\5")):
         far.send(sent)
     heard = frames.receive(0.0)
-    assert [(can_id, data) for can_id, data, _ in heard] == [
+    assert [(can_id, data) for can_id, data in heard] == [
         (0x181, b"12345678"), (0x182 | FD_FRAME, b"x" * 20), (0x701, b"\5"),
     ]  # fmt: skip
     assert frames.receive(0.001) is None
@@ -60,7 +60,7 @@ def test_old_bytes_of_a_longer_frame_are_not_read_again(joined):
     frames.receive(0.0)
     far.send(packet(0x181, b"12"))
     far.send(packet(0x181, b"12")[:4] + b"\x40" + packet(0x181, b"12")[5:])  # a length that no classical frame has
-    assert [data for _, data, _ in frames.receive(0.0)] == [b"12", b"12" + bytes(6)]
+    assert [data for _, data in frames.receive(0.0)] == [b"12", b"12" + bytes(6)]
 
 
 def test_frames_that_are_nobodys_are_left_out_and_error_frames_tell_of_the_controller(joined):
@@ -102,7 +102,7 @@ def test_any_other_interface_goes_by_messages_and_says_the_same():
             can.Message(arbitration_id=0x40, is_error_frame=True),
         ):
             other.send(message)
-        assert [(can_id, data) for can_id, data, _ in frames.receive(0.0)] == [(0x181, b"12")]
+        assert [(can_id, data) for can_id, data in frames.receive(0.0)] == [(0x181, b"12")]
         assert frames.controller == BUS_OFF and frames.receive(0.0) is None
         other.send(can.Message(arbitration_id=0x181, data=b"12"))
         assert frames.receive(0.0) == [] and frames.receive(0.0) is None

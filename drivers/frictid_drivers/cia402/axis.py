@@ -76,6 +76,7 @@ class Axis:
         self._reset_wanted = False
         self._resetting = 0
         self._target_units: int | None = None
+        self._told_units = 0  # the same as it goes out
         self._held_at_rad: float | None = None
         self._secondary_told: tuple[int, int, int, int] | None = None
         self._stop_look_cycles = max(2, reset_cycles // 5)
@@ -139,8 +140,6 @@ class Axis:
 
     def command(self, set_point: SetPoint, actual_units: int, *, healthy: bool) -> None:
         """Fill the coming cycle's frames, without power unless ``healthy``; ``SafetyAbort`` for what is no number."""
-        if self._following_status == self.feedback.status_raw and self._goes_on(set_point):
-            return
         shown = self.feedback.mode
         mode = self.mode
         controlword = self._controlword(healthy)
@@ -174,7 +173,7 @@ class Axis:
         if controlword == ENABLE and enabled and self._mode_value(mode) == INTERPOLATED:
             controlword |= _INTERPOLATE
         primary.set("controlword", controlword)
-        primary.set("target_position", self._target_units)
+        self._told_units = primary.set("target_position", self._target_units)
         primary.set("torque_offset", offset)
         primary.pack()
         told = (offset, self._mode_value(mode), torque, velocity)
@@ -184,15 +183,21 @@ class Axis:
                 self.secondary.set(meaning, value)
             self.secondary.pack()
 
-    def _goes_on(self, set_point: SetPoint) -> bool:
-        """The same status as when it followed a position in the last cycle: only place and torque are new."""
+    def goes_on(self, set_point: SetPoint) -> bool:
+        """It follows a position as in the last cycle, only the place is new: done. False: ``command`` is needed."""
+        feedback = self.feedback
+        if self._following_status != feedback.status_raw:
+            return False
         torque_nm = set_point.torque_offset_nm
         offset = self._torque(torque_nm) if torque_nm else 0
-        if self.feedback.mode is not Mode.POSITION or self._secondary_told is None or offset != self._secondary_told[0]:
+        if feedback.mode is not Mode.POSITION or self._secondary_told is None or offset != self._secondary_told[0]:
             self._following_status = _NEVER
             return False
-        self._target_units = self._units(set_point.position_rad, self._scale.position_rad)
-        self.primary.set("target_position", self._target_units)
+        units = set_point.position_rad / self._scale.position_rad
+        if not math.isfinite(units):
+            raise self._not_a_number("set-point", set_point.position_rad)
+        self._target_units = round(units)
+        self._told_units = self.primary.set("target_position", self._target_units)
         self.primary.pack()
         return True
 
@@ -210,7 +215,7 @@ class Axis:
 
     def sent(self) -> None:
         """The primary command went out: its target is in force from the next SYNC on, in the mode that follows it."""
-        target_rad = self.primary.value("target_position") * self._scale.position_rad
+        target_rad = self._told_units * self._scale.position_rad
         self.feedback.position_command_rad = target_rad if self.mode is Mode.POSITION else math.nan
 
     def emergency(self) -> tuple[Command, Command]:

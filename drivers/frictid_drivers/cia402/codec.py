@@ -25,6 +25,7 @@ MALFORMED_EMERGENCY = 0x1000  # error code shown for an EMCY frame too short to 
 
 _ATTRIBUTES = {meaning: key.removesuffix("_per_unit") for meaning, key in FIGURES.items()}
 _MODES = {mode.value: mode for mode in Mode} | {INTERPOLATED: Mode.POSITION}
+_NEVER = -math.inf
 _LIMIT_ACTIVE = 0x0800  # statusword bit 11: a set-point or the torque is cut by a limit of the drive
 
 
@@ -148,11 +149,13 @@ class Decoder:
         self._awaited = sum(report.awaited for report in self._reports.values())
         # Number of the present row, from 1, and awaited reports that have not come in it.
         self.cycle = self._t_ns = self.missing = 0
+        self._oldest_heartbeat_ns: float = _NEVER
         self.feedback = [joint.feedback for joint in self._joints]  # always the same objects
 
     def restart(self) -> None:
         """Forget every report, as at the start of cycling; the feedback objects stay the same."""
         self.cycle = self._t_ns = self.missing = 0
+        self._oldest_heartbeat_ns = _NEVER
         for report in self._reports.values():
             report.cycle = -1
         blank = Feedback()
@@ -172,22 +175,35 @@ class Decoder:
 
     def feed(self, t_ns: int, cob_id: int, data: bytes | bytearray) -> bool:
         """Take one frame; False when it is none of ours. A report shorter than its mapping marks its joint invalid."""
-        report = self._reports.get(cob_id)
-        if report is None:
-            return self._service(t_ns, cob_id, data)
-        joint = report.joint
+        return not self.take(t_ns, ((cob_id, data),))
+
+    def take(self, t_ns: int, frames: Sequence[tuple[int, bytes | bytearray]]) -> list[tuple[int, bytes | bytearray]]:
+        """Take frames as ``feed`` does, in order; those that are none of ours come back."""
+        others: list[tuple[int, bytes | bytearray]] = []
+        reports, cycle = self._reports, self.cycle
+        for frame in frames:
+            cob_id, data = frame
+            report = reports.get(cob_id)
+            if report is None:
+                if not self._service(t_ns, cob_id, data):
+                    others.append(frame)
+            elif len(data) < report.size:
+                report.joint.feedback.valid = False
+            else:
+                report.values = report.unpack(data)
+                if report.cycle != cycle:
+                    report.cycle = cycle
+                    report.t_ns = self._t_ns
+                    if report.awaited:
+                        self.missing -= 1
+                if not report.figures_only:
+                    self._tell(report)
+        return others
+
+    def _tell(self, report: _Report) -> None:
+        """What a report says beside its figures is so at once."""
+        joint, values = report.joint, report.values
         feedback = joint.feedback
-        if len(data) < report.size:
-            feedback.valid = False
-            return True
-        values = report.values = report.unpack(data)
-        if report.cycle != self.cycle:
-            report.cycle = self.cycle
-            report.t_ns = self._t_ns
-            if report.awaited:
-                self.missing -= 1
-        if report.figures_only:
-            return True
         if report.status_at >= 0:
             status = feedback.status_raw = values[report.status_at]
             feedback.state = JOINT_STATES[status & 0x6F]
@@ -205,7 +221,6 @@ class Decoder:
         if report.slow:
             for at, attribute, factor in report.figures:
                 setattr(feedback, attribute, values[at] * factor)
-        return True
 
     def has(self, cob_id: int) -> bool:
         """This report has already come in the present row."""
@@ -246,6 +261,10 @@ class Decoder:
         """When the joint's last heartbeat came; None before the first."""
         return self._joints[joint].heartbeat_ns
 
+    def all_alive(self, since_ns: int) -> bool:
+        """Every joint's heartbeat has come since then, and none was reset."""
+        return since_ns <= self._oldest_heartbeat_ns
+
     def restarted(self, joint: int) -> bool:
         """A boot-up frame came: the drive was reset."""
         return self._joints[joint].restarted
@@ -257,6 +276,8 @@ class Decoder:
             if data and data[0] & 0x7F == 0:
                 joint.restarted = True
                 joint.feedback.state = JointState.UNKNOWN
+            alive = [_NEVER if one.restarted or one.heartbeat_ns is None else one.heartbeat_ns for one in self._joints]
+            self._oldest_heartbeat_ns = min(alive)
             return True
         joint = self._emergencies.get(cob_id)
         if joint is None:
@@ -284,17 +305,14 @@ class Command:
     def __contains__(self, meaning: str) -> bool:
         return meaning in self._at
 
-    def set(self, meaning: str, value: int) -> None:
-        """Set one entry; nothing happens where the frame does not carry it."""
+    def set(self, meaning: str, value: int) -> int:
+        """Set one entry; as it goes out, which is 0 where the frame does not carry it."""
         at = self._at.get(meaning)
-        if at is not None:
-            low, high = self._bounds[at]
-            self._values[at] = low if value < low else high if value > high else value
-
-    def value(self, meaning: str) -> int:
-        """One entry as it goes out; 0 where the frame does not carry it."""
-        at = self._at.get(meaning)
-        return 0 if at is None else self._values[at]
+        if at is None:
+            return 0
+        low, high = self._bounds[at]
+        self._values[at] = value = low if value < low else high if value > high else value
+        return value
 
     def pack(self) -> bytearray:
         """All entries into the frame's own buffer."""

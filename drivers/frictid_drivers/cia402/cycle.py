@@ -21,6 +21,7 @@ waiting for any answer.
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Sequence
 
 import can
@@ -35,7 +36,7 @@ from frictid_hil.errors import FrictidError, HardwareError, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.can_bus import BUS_ERRORS
 from frictid_hil.protocol.can_frames import BUS_OFF, CONTROLLER_STATES, Heard, frames_of
-from frictid_hil.protocol.driver import FD_FRAME, Clock, Feedback, FrameSink, SetPoint
+from frictid_hil.protocol.driver import FD_FRAME, Clock, Feedback, FrameSink, SetPoint, by_the_batch
 
 SYNC_COB_ID = 0x80
 _OPERATIONAL = b"\x05"
@@ -79,7 +80,7 @@ class Cycle:
     ) -> None:
         self._frames = frames_of(bus)
         self._clock = clock
-        self._sink = sink
+        self._log = by_the_batch(sink)
         self._axes = list(axes)
         self._decoder = decoder
         self._other = other
@@ -88,16 +89,16 @@ class Cycle:
         self._drive_timeout_ns = round(settings.drive_timeout_s * 1e9)
         self._active = [axis.joint in layout.active for axis in axes]
         self._fd = layout.fd
-        self._resend = [layout.resend_cycles.get(axis.joint, 0) for axis in axes]
         self._primary = [_Outgoing(axis, axis.primary, fd=layout.fd) for axis in axes]
         self._secondary = [_Outgoing(axis, axis.secondary, fd=layout.fd) for axis in axes]
+        resend_cycles = [layout.resend_cycles.get(axis.joint, 0) for axis in axes]
+        self._joints = list(zip(axes, self._primary, self._secondary, self._active, resend_cycles, strict=True))
         self._wheres = [f"joint {joint.name} (node {joint.node})" for joint in frame_map.joints]
         self._sync = bytes(1 if layout.sync_overflow else 0)
         self._overflow = layout.sync_overflow
         self._counter = 0
         self._heartbeat = (HEARTBEAT_BASE + settings.host_node, _OPERATIONAL)
         self._heartbeat_due_ns = 0
-        self._healthy = [False] * len(self._axes)
         self._nodes = [joint.node for joint in frame_map.joints]
         self._reporter = {frame.cob_id: at for at, joint in enumerate(frame_map.joints) for frame in joint.reports}
         self._other_kind: int | None = None
@@ -122,7 +123,7 @@ class Cycle:
         decoder, clock = self._decoder, self._clock
         begun = False
         try:
-            self._take_late(clock.now_ns())
+            self._take_late()
             due = self._due(set_points)
             if self._overflow:
                 self._counter = self._counter % self._overflow + 1
@@ -136,7 +137,7 @@ class Cycle:
             try:
                 self._frames.send(frames)
             finally:
-                self._log_sent(frames, now_ns)  # the drives answer meanwhile
+                self._log(now_ns, frames, True)  # the drives answer meanwhile
             for outgoing, (_, data) in zip(due, frames, strict=False):
                 outgoing.told = data
                 outgoing.told_cycle = decoder.cycle
@@ -146,7 +147,7 @@ class Cycle:
             if now_ns >= self._heartbeat_due_ns:
                 # After the reports, so that no SYNC ever waits behind it.
                 self._heartbeat_due_ns = now_ns + self._host_heartbeat_ns
-                self._log_sent([self._heartbeat], clock.now_ns())
+                self._log(clock.now_ns(), [self._heartbeat], True)
                 self._frames.send([self._heartbeat])
             self._failures = 0
         except FrictidError:
@@ -220,26 +221,25 @@ class Cycle:
 
     def _due(self, set_points: Sequence[SetPoint]) -> list[_Outgoing]:
         """What is sent in this cycle: every moving joint's frame, and one more that has changed."""
-        position_units = self._decoder.position_units
+        decoder = self._decoder
         due = []
         changed = False
-        for at, axis in enumerate(self._axes):
-            primary, secondary = self._primary[at], self._secondary[at]
-            if not axis.steady:
-                actual_units = position_units(at)
-                if actual_units is None:
-                    continue
-                try:
-                    axis.command(set_points[at], actual_units, healthy=self._healthy[at])
-                except SafetyAbort:
-                    self.quick_stop()
-                    raise
-            if self._resend[at]:
+        for at, (axis, primary, secondary, active, resend) in enumerate(self._joints):
+            try:
+                if not axis.goes_on(set_points[at]) and not axis.steady:
+                    actual_units = decoder.position_units(at)
+                    if actual_units is None:
+                        continue
+                    axis.command(set_points[at], actual_units, healthy=decoder.heartbeat_ns(at) is not None)
+            except SafetyAbort:
+                self.quick_stop()
+                raise
+            if resend:
                 # A drive that supervises its RPDOs hears them again before it misses them.
                 for outgoing in (primary, secondary):
-                    if self._decoder.cycle - outgoing.told_cycle >= self._resend[at]:
+                    if decoder.cycle - outgoing.told_cycle >= resend:
                         outgoing.told = b""
-            if self._active[at]:
+            if active:
                 regular, other = (primary, secondary) if axis.mode is Mode.POSITION else (secondary, primary)
                 due.append(regular)
                 changed = changed or other.data != other.told
@@ -261,18 +261,12 @@ class Cycle:
                     return [outgoing]
         return []
 
-    def _log_sent(self, frames: Sequence[tuple[int, bytes]], t_ns: int) -> None:
-        if self._sink is not None:
-            for can_id, data in frames:
-                self._sink(t_ns, can_id, data, True)
-
     def _send_whatever_happens(self, cob_id: int, data: bytes | bytearray, *, fd: bool = False) -> None:
         can_id = cob_id | FD_FRAME if fd else cob_id
         # Nothing may keep the next joint from being stopped, whatever this interface raises.
         with contextlib.suppress(Exception):
             self._frames.send_alone(can_id, bytes(data))
-            if self._sink is not None:
-                self._sink(self._clock.now_ns(), can_id, bytes(data), True)
+            self._log(self._clock.now_ns(), [(can_id, bytes(data))], True)
 
     def _wire_failed(self, error: Exception) -> None:
         """One frame that could not be sent is a missed cycle; several in a row are a broken bus."""
@@ -308,31 +302,39 @@ class Cycle:
             self._take(heard, now_ns())
 
     def _take(self, heard: Sequence[Heard], t_ns: int) -> None:
-        sink, feed, fd = self._sink, self._decoder.feed, self._fd
-        late = t_ns > self._window_end_ns
-        for can_id, data, arrived_s in heard:
-            if sink is not None:
-                sink(t_ns, can_id, data, False)
-            cob_id = can_id & ~FD_FRAME
-            if (cob_id != can_id) is not fd and self._other_kind is None:
-                self._other_kind = self._reporter.get(cob_id)
-            if late:
-                # Kept until the next row begins, as a replay of the log will.
-                self._late.append((cob_id, data, arrived_s))
-            elif not feed(t_ns, cob_id, data):
-                self._other(cob_id, bytearray(data), arrived_s)
+        self._log(t_ns, heard, False)
+        if t_ns > self._window_end_ns:
+            # Kept until the next row begins, as a replay of the log will.
+            self._late += heard
+        else:
+            self._feed(heard, t_ns)
 
-    def _take_late(self, now_ns: int) -> None:
+    def _take_late(self) -> None:
         """What came after the last row was closed: fed before the next one begins."""
-        t_ns = max(now_ns, self._window_end_ns + 1)
-        receive = self._frames.receive
+        receive, t_ns = self._frames.receive, max(self._clock.now_ns(), self._window_end_ns + 1)
         while (heard := receive(0.0)) is not None:
             self._take(heard, t_ns)
         if self._late:
-            for cob_id, data, arrived_s in self._late:
-                if not self._decoder.feed(t_ns, cob_id, data):
-                    self._other(cob_id, bytearray(data), arrived_s)
-            self._late.clear()
+            late, self._late = self._late, []
+            self._feed(late, t_ns)
+
+    def _feed(self, heard: Sequence[Heard], t_ns: int) -> None:
+        """The decoder knows identifiers without the kind of frame; a report in the other kind is noted."""
+        if self._fd:
+            for can_id, _ in heard:
+                if not can_id & FD_FRAME:
+                    self._note_other_kind(can_id)
+            heard = [(can_id & ~FD_FRAME, data) for can_id, data in heard]
+        for can_id, data in self._decoder.take(t_ns, heard):
+            cob_id = can_id & ~FD_FRAME
+            if cob_id != can_id:
+                self._note_other_kind(cob_id)
+            if cob_id == can_id or not self._decoder.feed(t_ns, cob_id, data):
+                self._other(cob_id, bytearray(data), time.time())
+
+    def _note_other_kind(self, cob_id: int) -> None:
+        if self._other_kind is None:
+            self._other_kind = self._reporter.get(cob_id)
 
     def _check(self, now_ns: int) -> None:
         decoder = self._decoder
@@ -341,21 +343,24 @@ class Cycle:
         if self._other_kind is not None:
             at, self._other_kind = self._other_kind, None
             self._end(self._other_frames(at))
+        alive = decoder.all_alive(now_ns - self._drive_timeout_ns)
         for at, axis in enumerate(self._axes):
-            if decoder.restarted(at):
-                self._alarm(at, "booted up in the middle of the run: the drive was reset")
-            seen_ns = decoder.heartbeat_ns(at)
-            if seen_ns is None:
-                latest_ns = max(self._drive_timeout_ns, _FIRST_HEARTBEAT_NS)
-                if now_ns > latest_ns:
-                    self._alarm(at, f"no heartbeat within {latest_ns * 1e-9:g} s of the start")
-            else:
-                self._healthy[at] = True
-                if now_ns - seen_ns > self._drive_timeout_ns:
-                    self._alarm(at, f"no heartbeat for {(now_ns - seen_ns) * 1e-9:.3f} s")
+            if not alive:
+                self._check_heartbeat(at, now_ns)
             if axis.alarm is not None:
                 alarm, axis.alarm = axis.alarm, None
                 raise alarm
+
+    def _check_heartbeat(self, at: int, now_ns: int) -> None:
+        if self._decoder.restarted(at):
+            self._alarm(at, "booted up in the middle of the run: the drive was reset")
+        seen_ns = self._decoder.heartbeat_ns(at)
+        if seen_ns is None:
+            latest_ns = max(self._drive_timeout_ns, _FIRST_HEARTBEAT_NS)
+            if now_ns > latest_ns:
+                self._alarm(at, f"no heartbeat within {latest_ns * 1e-9:g} s of the start")
+        elif now_ns - seen_ns > self._drive_timeout_ns:
+            self._alarm(at, f"no heartbeat for {(now_ns - seen_ns) * 1e-9:.3f} s")
 
     def _other_frames(self, at: int) -> HardwareError:
         found, wanted = ("classical", "`fd: true`") if self._fd else ("CAN FD", "no `fd: true`")
