@@ -347,6 +347,34 @@ def test_a_drive_that_misses_its_pdo_is_stopped_by_sdo_and_then_by_nmt_within_30
     assert drive.values[0x6041, 0] & 0x4F == 0x40
 
 
+def test_a_command_that_somebody_else_sends_stops_all_in_the_same_cycle():
+    b = bench(1, 2).open().start()
+    b.power()
+    b.bus.put(0x202, bytes.fromhex("0f00 10270000 0000"))
+    with pytest.raises(SafetyAbort, match=r"joint 1 .*somebody else commands.*0x202"):
+        b.cycle(1)
+    b.cycle(1)
+    assert all(drive.values[0x6041, 0] & 0x6F == 0x07 for drive in b.drives)
+
+
+def test_an_adapter_that_echoes_our_own_frames_is_no_second_master():
+    b = bench(1).open().start()
+    b.power()
+    send = b.bus.send
+
+    def echoed(message, timeout=None):
+        send(message)
+        b.bus.put(message.arbitration_id, bytes(message.data))
+
+    b.bus.send = echoed
+    for step in range(20):
+        b.set_points[0].position_rad += 1e-4 * step
+        b.cycle(1)
+    b.driver.quick_stop()
+    b.cycle(3)
+    assert b.drives[0].values[0x6041, 0] & 0x6F == 0x07
+
+
 def test_a_drive_that_keeps_its_power_keeps_its_watchdog_and_is_named():
     drive = DeafDrive(1)
     b = Bench(drive, options={"sdo_timeout_s": 0.02}).open().start()

@@ -58,7 +58,7 @@ class _Outgoing:
         self.can_id = command.cob_id | FD_FRAME if fd else command.cob_id
         # The command's own buffer: packing the command is all it takes to update it.
         self.data = command.data
-        self.told = b""
+        self.told = self.told_before = b""
         self.told_cycle = 0
 
 
@@ -102,6 +102,10 @@ class Cycle:
         self._nodes = [joint.node for joint in frame_map.joints]
         self._reporter = {frame.cob_id: at for at, joint in enumerate(frame_map.joints) for frame in joint.reports}
         self._other_kind: int | None = None
+        self._commands = {
+            one.can_id & ~FD_FRAME: (at, one) for own in (self._primary, self._secondary) for at, one in enumerate(own)
+        }
+        self._stranger: tuple[int, int] | None = None  # (joint, identifier) of a command that we did not send
         self._window_end_ns = -1
         self._late: list[Heard] = []
         self._turn = 0
@@ -139,7 +143,7 @@ class Cycle:
             finally:
                 self._log(now_ns, frames, True)  # the drives answer meanwhile
             for outgoing, (_, data) in zip(due, frames, strict=False):
-                outgoing.told = data
+                outgoing.told_before, outgoing.told = outgoing.told, data
                 outgoing.told_cycle = decoder.cycle
                 if outgoing.primary:
                     outgoing.axis.sent()
@@ -167,6 +171,7 @@ class Cycle:
 
     def quick_stop(self) -> None:
         """Send the stop to all joints, active ones first, from any thread; never raises and waits for nothing."""
+        self._commands = {}  # what an adapter echoes of the stop is not what was told
         frames: list[Command] = []
         for active in (True, False):
             for axis, is_active in zip(self._axes, self._active, strict=True):
@@ -180,6 +185,7 @@ class Cycle:
 
     def cut_power(self) -> None:
         """Controlword 00 to all joints: the last resort where a joint would not come to rest; never raises."""
+        self._commands = {}
         for at, axis in enumerate(self._axes):
             axis.primary.set("controlword", DISABLE_VOLTAGE)
             axis.primary.set("torque_offset", 0)
@@ -329,8 +335,16 @@ class Cycle:
             cob_id = can_id & ~FD_FRAME
             if cob_id != can_id:
                 self._note_other_kind(cob_id)
-            if cob_id == can_id or not self._decoder.feed(t_ns, cob_id, data):
+            if cob_id in self._commands:
+                self._note_command(cob_id, data)
+            elif cob_id == can_id or not self._decoder.feed(t_ns, cob_id, data):
                 self._other(cob_id, bytearray(data), time.time())
+
+    def _note_command(self, cob_id: int, data: bytes | bytearray) -> None:
+        """A command that we did not send, unless it is an echo of our own, as some adapters give it."""
+        at, own = self._commands[cob_id]
+        if data not in (own.told, own.told_before) and self._stranger is None:
+            self._stranger = at, cob_id
 
     def _note_other_kind(self, cob_id: int) -> None:
         if self._other_kind is None:
@@ -343,6 +357,8 @@ class Cycle:
         if self._other_kind is not None:
             at, self._other_kind = self._other_kind, None
             self._end(self._other_frames(at))
+        if self._stranger is not None:
+            self._end(self._other_master(*self._stranger))
         alive = decoder.all_alive(now_ns - self._drive_timeout_ns)
         for at, axis in enumerate(self._axes):
             if not alive:
@@ -370,6 +386,14 @@ class Cycle:
             cause=f"CAN FD is {'not ' if self._fd else ''}switched on in this drive",
             next_step="switch it with the vendor's tool, name the object that does as `fd_object` in the joint's "
             "options, or change `fd`",
+        )
+
+    def _other_master(self, at: int, cob_id: int) -> SafetyAbort:
+        return SafetyAbort(
+            f"somebody else commands this drive: identifier {cob_id:#05x} came with other data than ours",
+            where=self._wheres[at],
+            cause="a second master on the bus: a controller, a vendor's tool, or a run on another computer",
+            next_step="stop it or take it off the bus, then run `frictid-hil check`",
         )
 
     def _alarm(self, at: int, what: str) -> None:

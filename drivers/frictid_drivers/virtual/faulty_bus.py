@@ -84,8 +84,11 @@ class FaultyBus(can.BusABC):
         self._inject()
         now_ns, elapsed_ns = self._clock(), self._elapsed_ns()
         self._incoming.hear(msg.arbitration_id, bytes(msg.data))
-        for due_ns, can_id, data in self._outgoing.through(now_ns, elapsed_ns, msg.arbitration_id, bytes(msg.data)):
+        passed = self._outgoing.through(now_ns, elapsed_ns, msg.arbitration_id, bytes(msg.data))
+        for number, (due_ns, can_id, data) in enumerate(passed):
             frame = _changed(msg, can_id, data)
+            if number and can_id in self._outgoing.foreign:
+                self._received.append(frame)  # whoever sent it, the host hears it as well as the drives
             if due_ns > now_ns:
                 self._late_out.put(due_ns, partial(self._pass, self._bus.send, frame))
             else:

@@ -49,8 +49,12 @@ class FaultyRack(FaultSchedule):
         if can_id not in self._frames.cob_ids:
             self._to_drives(can_id, data, remote)
             return
-        for due_ns, out_id, out in self._frames.through(self.now_ns, self._elapsed_ns(), can_id, data):
+        passed = self._frames.through(self.now_ns, self._elapsed_ns(), can_id, data)
+        for number, (due_ns, out_id, out) in enumerate(passed):
             self._at(due_ns, partial(self._to_drives, out_id, out, remote))
+            if number and out_id in self._frames.foreign:
+                # Whoever sent it, the host hears it as well as the drives.
+                self._at(due_ns, partial(self._to_host, out_id, out))
 
     def _advance_devices(self, to_ns: int) -> None:
         drives_ns = self._drives_ns + round((to_ns - self._host_ns) * self._pace)

@@ -54,6 +54,8 @@ class WireFaults:
         plain = {cob_id for _, cob_ids in self._frames for cob_id in cob_ids}
         bases = (_SDO_ANSWER, _SDO_REQUEST, *(base for n in "1234" for base in SERVICES[f"tpdo{n}"]))
         plain |= {base + node for report in self._reports for node in report.fault.nodes for base in bases}
+        foreign = {c for state, cob_ids in self._frames if state.fault.kind == "foreign" for c in cob_ids}
+        self.foreign = frozenset(foreign | {cob_id | FD_FRAME for cob_id in foreign})
         self.cob_ids = frozenset(plain | {cob_id | FD_FRAME for cob_id in plain})
 
     def hear(self, can_id: int, data: bytes) -> None:
