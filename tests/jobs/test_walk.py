@@ -66,7 +66,7 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("walk"))
         probe(patch, LockStepBus, "send", "", lambda given: given[1].arbitration_id == SET_POINT_FRAME)
-        probe(patch, Decoder, "feed", "CyclicLoop.cycle")
+        probe(patch, Decoder, "take", "CyclicLoop.cycle")
         probe(patch, Ring, "append", "CyclicLoop.cycle", lambda given: len(given) > 8)
         probe(patch, RowKeeper, "samples", "drain")
         probe(patch, RowKeeper, "taken", "_Measured.identify")
@@ -90,8 +90,8 @@ def test_a_set_point_reaches_the_wire_through_twelve_functions_at_most(walks: di
 
 
 def test_a_sample_reaches_the_profile_through_fifteen_functions_at_most(walks: dict[str, list[str]]) -> None:
-    stations = ("feed", "append", "samples", "taken", "estimate")
-    last = {"feed": "Decoder.feed", "append": "Ring.append", "samples": "RowKeeper.samples", "taken": "RowKeeper.taken"}
+    stations = ("take", "append", "samples", "taken", "estimate")
+    last = {"take": "Decoder.take", "append": "Ring.append", "samples": "RowKeeper.samples", "taken": "RowKeeper.taken"}
     walk = list(dict.fromkeys(name for s in stations for name in [*walks[s], last.get(s, "estimate")]))
     assert {"CyclicLoop.cycle", "drain", "identify_joint"} <= set(walk)
     assert len(walk) <= 15, walk

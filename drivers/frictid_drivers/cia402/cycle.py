@@ -307,25 +307,16 @@ class Cycle:
                 return
             self._take(heard, now_ns())
 
-    def _take(self, heard: Sequence[Heard], t_ns: int) -> None:
-        self._log(t_ns, heard, False)
-        if t_ns > self._window_end_ns:
-            # Kept until the next row begins, as a replay of the log will.
-            self._late += heard
-        else:
-            self._feed(heard, t_ns)
+    def _take(self, heard: Sequence[Heard], t_ns: int, *, waited: bool = False) -> None:
+        """Log and decode. What comes after the window waits until the next row begins, as in a replay of the log.
 
-    def _take_late(self) -> None:
-        """What came after the last row was closed: fed before the next one begins."""
-        receive, t_ns = self._frames.receive, max(self._clock.now_ns(), self._window_end_ns + 1)
-        while (heard := receive(0.0)) is not None:
-            self._take(heard, t_ns)
-        if self._late:
-            late, self._late = self._late, []
-            self._feed(late, t_ns)
-
-    def _feed(self, heard: Sequence[Heard], t_ns: int) -> None:
-        """The decoder knows identifiers without the kind of frame; a report in the other kind is noted."""
+        The decoder knows identifiers without the kind of frame; a report in the other kind is noted.
+        """
+        if not waited:
+            self._log(t_ns, heard, False)
+            if t_ns > self._window_end_ns:
+                self._late += heard
+                return
         if self._fd:
             for can_id, _ in heard:
                 if not can_id & FD_FRAME:
@@ -335,16 +326,24 @@ class Cycle:
             cob_id = can_id & ~FD_FRAME
             if cob_id != can_id:
                 self._note_other_kind(cob_id)
-            if cob_id in self._commands:
-                self._note_command(cob_id, data)
+            if (command := self._commands.get(cob_id)) is not None:
+                self._note_command(*command, data)
             elif cob_id == can_id or not self._decoder.feed(t_ns, cob_id, data):
                 self._other(cob_id, bytearray(data), time.time())
 
-    def _note_command(self, cob_id: int, data: bytes | bytearray) -> None:
+    def _take_late(self) -> None:
+        """What came after the last row was closed: fed before the next one begins."""
+        receive, t_ns = self._frames.receive, max(self._clock.now_ns(), self._window_end_ns + 1)
+        while (heard := receive(0.0)) is not None:
+            self._take(heard, t_ns)
+        if self._late:
+            late, self._late = self._late, []
+            self._take(late, t_ns, waited=True)
+
+    def _note_command(self, at: int, own: _Outgoing, data: bytes | bytearray) -> None:
         """A command that we did not send, unless it is an echo of our own, as some adapters give it."""
-        at, own = self._commands[cob_id]
         if data not in (own.told, own.told_before) and self._stranger is None:
-            self._stranger = at, cob_id
+            self._stranger = at, own.can_id & ~FD_FRAME
 
     def _note_other_kind(self, cob_id: int) -> None:
         if self._other_kind is None:
