@@ -193,10 +193,7 @@ class Axis:
         if feedback.mode is not Mode.POSITION or self._secondary_told is None or offset != self._secondary_told[0]:
             self._following_status = _NEVER
             return False
-        units = set_point.position_rad / self._scale.position_rad
-        if not math.isfinite(units):
-            raise self._not_a_number("set-point", set_point.position_rad)
-        self._target_units = round(units)
+        self._target_units = self._units(set_point.position_rad, self._scale.position_rad)
         self._told_units = self.primary.set("target_position", self._target_units)
         self.primary.pack()
         return True
