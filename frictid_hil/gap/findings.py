@@ -55,6 +55,7 @@ class Sampled:
     # By cause, one-sigma of what the forms of the others may have put on it, in the same unit.
     blurs: Mapping[str, Array]
     believed: Mapping[str, Array]  # by cause, one-sigma of its size before anything is recorded, in the same unit
+    tolerated: Mapping[str, Array]  # the same of what the belief's tolerance alone allows
     generic: Array  # the same of all generic functions together
     explained: Array  # the same of all causes together
     gram: Array  # mean products of the channel's columns over all its rows, shape (m, m)
@@ -66,7 +67,7 @@ def sampled(posterior: Posterior) -> Sampled:
     x = np.concatenate([log.x[log.told] - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
     draws = [plainest(posterior, draw, gram) for draw in posterior.draws(posterior.search(), DRAWS)]
-    sizes, blurs, believed = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(3))
+    sizes, blurs, believed, tolerated = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(4))
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
 
     def size_of(parts: Sequence[tuple[np.ndarray, Array]]) -> float:
@@ -84,11 +85,12 @@ def sampled(posterior: Posterior) -> Sampled:
         for effect, net, blur in zip(causes, *_net([*causes.values(), *unnamed], gram), strict=False):
             sizes[effect][k] = net / posterior.floor
             blurs[effect][k] = blur / posterior.floor
-        for effect, square in posterior.believed(draw, np.diag(gram)).items():
-            believed[effect][k] = math.sqrt(square) / posterior.floor
+        for effect, (within, whole) in posterior.believed(draw, np.diag(gram)).items():
+            tolerated[effect][k] = math.sqrt(within) / posterior.floor
+            believed[effect][k] = math.sqrt(whole) / posterior.floor
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
-    return Sampled(posterior, draws, sizes, blurs, believed, generic, explained, gram)
+    return Sampled(posterior, draws, sizes, blurs, believed, tolerated, generic, explained, gram)
 
 
 def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array, Array]:
@@ -108,8 +110,7 @@ def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array,
     taken_back = np.where(cancels, inner, 0.0).sum(axis=1) / own
     net: Array = np.maximum(0.0, own + taken_back)
     apart = np.sqrt(np.maximum(1.0 - (inner / (own[:, None] * own)) ** 2, FORM**2))
-    lent = FORM * own / apart
-    np.fill_diagonal(lent, 0.0)
+    lent = np.where(own > own[:, None], FORM * own / apart, 0.0)
     return net, np.max(lent, axis=1, initial=0.0)
 
 
@@ -154,30 +155,39 @@ def either_way(channels: Sequence[Sampled]) -> list[str]:
 
 
 def _over_channels(what: str, name: str, channels: Sequence[Sampled]) -> Array:
-    """Root of the squares of ``sizes``, ``blurs`` or ``believed`` of a cause over the channels, one a draw."""
+    """Root of the squares of one attribute (``sizes``, ``blurs``, ...) of a cause over the channels, one a draw."""
     nothing = np.zeros(DRAWS)
     return np.sqrt(sum((getattr(c, what).get(name, nothing) ** 2 for c in channels), nothing))
 
 
 def _sides(name: str, channels: Sequence[Sampled]) -> tuple[float, float]:
     """(Chance that a cause shows as it is told, that it shows the other way round, which only an error can)."""
-    size, blur, believed = (_over_channels(what, name, channels) for what in ("sizes", "blurs", "believed"))
-    told, other = (float(np.mean(c)) for c in _chances(size, np.maximum(blur, FORM), believed))
+    size, blur, tolerated, believed = (
+        _over_channels(what, name, channels) for what in ("sizes", "blurs", "tolerated", "believed")
+    )
+    chances = _chances(size, np.maximum(blur, FORM), tolerated, believed, channels[0].posterior.chance)
+    told, other = (float(np.mean(chance)) for chance in chances)
     is_error = any(t.effect == name and not t.shape for c in channels for t in c.posterior.channel.nuisances)
     return told, other if is_error else 0.0
 
 
-def _chances(size: Array, blur: Array, believed: Array) -> tuple[Array, Array]:
+def _chances(size: Array, blur: Array, tolerated: Array, believed: Array, prior: float) -> tuple[Array, Array]:
     """(That a cause shows as it is told, that it shows the other way round), one a draw, (draws,) each.
 
-    A draw knows the size as if all forms were right; they blur it, and what was believed of it holds against that.
+    A draw knows the size as if all forms were right; they blur it. Two beliefs hold against that: that it is no larger
+    than its tolerance allows, and, with the prior chance of a cause, that it is as large as a cause may be.
     """
-    held = believed**2 / (believed**2 + blur**2)
-    middle, spread = held * size, np.maximum(np.sqrt(held) * blur, 1e-9)
+    blurred, wide = tolerated**2 + blur**2, believed**2 + blur**2
+    odds = 0.5 * size**2 * (1.0 / blurred - 1.0 / wide) - 0.5 * np.log(wide / blurred)
+    beyond: Array = special.expit(special.logit(prior) + odds)
+    told, other = np.zeros(size.size), np.zeros(size.size)
+    for chance, width in ((1.0 - beyond, tolerated), (beyond, believed)):
+        held = width**2 / (width**2 + blur**2)
+        middle, spread = held * size, np.maximum(np.sqrt(held) * blur, 1e-9)
+        told += chance * special.ndtr((middle - VISIBLE) / spread)
+        other += chance * special.ndtr((-middle - VISIBLE) / spread)
     there = size > 0.0
-    told: Array = np.where(there, special.ndtr((middle - VISIBLE) / spread), 0.0)
-    other: Array = np.where(there, special.ndtr((-middle - VISIBLE) / spread), 0.0)
-    return told, other
+    return np.where(there, told, 0.0), np.where(there, other, 0.0)
 
 
 def _rivals(row: int, names: Sequence[str], there: np.ndarray, shown: Array) -> tuple[str, ...]:

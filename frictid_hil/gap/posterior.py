@@ -78,6 +78,7 @@ class Posterior:
     Attributes:
         floor: RMS that noise alone leaves.
         doubt: variance of what tells models apart, over that of the noise; from the search on.
+        chance: of any one cause, before anything is recorded.
     """
 
     def __init__(self, channel: Channel, library: int) -> None:
@@ -90,7 +91,8 @@ class Posterior:
     def begin(self, library: int) -> None:
         """Nothing has been searched yet; ``library`` as above."""
         self.doubt = 1.0
-        self._chance = math.log(EXPECTED / library)
+        self.chance = EXPECTED / library
+        self._chance = math.log(self.chance)
         self._known: dict[tuple[int, ...], Model] = {}
         self._prepare_blocks()
 
@@ -469,18 +471,20 @@ class Posterior:
             parts.setdefault(term.effect, []).append((np.array(term.columns, dtype=int), values))
         return {name: joined(own) for name, own in parts.items()}
 
-    def believed(self, draw: Draw, squares: Array) -> dict[str, float]:
+    def believed(self, draw: Draw, squares: Array) -> dict[str, tuple[float, float]]:
         """By cause: mean square of what it makes of the residual before anything is recorded.
 
-        ``squares`` holds the mean square of every column of the channel's table.
+        The first is of its tolerance alone, the second with the terms that the draw holds. ``squares`` holds the mean
+        square of every column of the channel's table.
         """
         care = self.settings[draw.setting].care
-        result: dict[str, float] = {}
+        result: dict[str, tuple[float, float]] = {}
         for k, term in enumerate(self.terms(draw.model)):
-            widened = care if k < len(self.channel.nuisances) else 1.0
-            expected = term.mean**2 + (widened * term.deviation) ** 2
+            tolerated = k < len(self.channel.nuisances)
+            expected = term.mean**2 + ((care if tolerated else 1.0) * term.deviation) ** 2
             made = float(expected @ squares[np.array(term.columns, dtype=int)])
-            result[term.effect] = result.get(term.effect, 0.0) + made
+            within, whole = result.get(term.effect, (0.0, 0.0))
+            result[term.effect] = within + made * tolerated, whole + made
         return result
 
 

@@ -203,22 +203,36 @@ def test_two_delays_that_pull_the_same_way_are_one_between_them() -> None:
     assert parameters("torque_delay", channel, draw) == pytest.approx({"delay_s": 0.03})
 
 
-@pytest.mark.parametrize(("believed", "blur"), [(0.2, 1.0), (1.0, 1.0), (4.0, 1.0), (1.0, 0.3)])
-def test_the_chance_of_a_blurred_error_is_the_share_of_drawn_ones_that_show(believed: float, blur: float) -> None:
-    rng = np.random.default_rng(5)
-    true = believed * rng.normal(size=2_000_000)
+@pytest.mark.parametrize(
+    ("tolerated", "believed", "blur"),
+    [(0.2, 0.2, 1.0), (1.0, 1.0, 1.0), (4.0, 4.0, 1.0), (1.0, 1.0, 0.3), (0.0, 4.0, 0.5), (0.3, 3.0, 0.5)],
+)
+def test_the_chance_of_a_blurred_error_is_the_share_of_drawn_ones_that_show(
+    tolerated: float, believed: float, blur: float
+) -> None:
+    rng, prior = np.random.default_rng(5), 0.1
+    true = np.where(rng.random(4_000_000) < prior, believed, tolerated) * rng.normal(size=4_000_000)
     seen = true + blur * rng.normal(size=true.size)
-    for size in (0.1, 0.6, 1.2):
+    for size in (0.1, 0.6, 1.2, 1.8):
         alike = true[np.abs(seen - size) < 0.02]
-        told, other = (np.mean(c) for c in _chances(*(np.full(DRAWS, value) for value in (size, blur, believed))))
+        values = (np.full(DRAWS, value) for value in (size, blur, tolerated, believed))
+        told, other = (np.mean(c) for c in _chances(*values, prior))
         assert told == pytest.approx(np.mean(alike > VISIBLE), abs=0.02)
         assert other == pytest.approx(np.mean(alike < -VISIBLE), abs=0.02)
 
 
 def test_what_the_forms_of_others_may_have_made_is_no_error_beyond_its_tolerance() -> None:
     size, blur = np.full(DRAWS, 0.3), np.full(DRAWS, 3.0)
-    narrow, wide = (sum(np.mean(c) for c in _chances(size, blur, np.full(DRAWS, s))) for s in (0.1, 10.0))
+    narrow, wide = (
+        sum(np.mean(c) for c in _chances(size, blur, w, w, 0.04)) for w in np.full((2, DRAWS), [[0.1], [10.0]])
+    )
     assert narrow < 0.01 < 0.8 < wide
+
+
+def test_a_cause_that_the_form_of_a_larger_one_may_have_made_is_as_likely_as_any_before_the_recording() -> None:
+    size, none, wide = np.full(DRAWS, 1.0), np.zeros(DRAWS), np.full(DRAWS, 3.0)
+    blurred, plain = (sum(np.mean(c) for c in _chances(size, np.full(DRAWS, b), none, wide, 0.04)) for b in (1.0, 0.1))
+    assert blurred < 0.1 < 0.99 < plain
 
 
 @pytest.mark.parametrize(("mean", "deviation"), [(0.0, 2.0), (1.0, 0.1)])
@@ -232,5 +246,6 @@ def test_a_cause_is_believed_to_show_at_its_strength_and_what_that_may_be_off(me
     posterior = Posterior(Channel("actuation", 0.01, tuple(logs), (), (term,), 1.0, 20.0), 20)
     draw = posterior.draws(posterior.search(), 1)[0]
     drawn = mean + deviation * random.standard_normal(100_000)
-    found = posterior.believed(draw, np.full(1, np.mean(shape**2)))["torque_saturation"]
+    tolerated, found = posterior.believed(draw, np.full(1, np.mean(shape**2)))["torque_saturation"]
+    assert tolerated == 0.0
     assert found == pytest.approx(float(np.mean(drawn**2) * np.mean(shape**2)), rel=0.05)
