@@ -49,7 +49,7 @@ BEGIN, END = "<!-- written by benchmarks/gap_sensitivity.py -->", "<!-- end of w
 FACTORS = (0.5, 2.0)
 LATE: tuple[tuple[ModuleType, str], ...] = (
     (findings, "VISIBLE"), (findings, "ALIKE"), (findings, "SIDED"), (findings, "UNTOLD"), (verdict, "FLOORS"),
-    (verdict, "AS_STATED"), (verdict, "FLOORS_AS_STATED"), (verdict, "STANDS_OUT"), (verdict, "UNNAMED"),
+    (verdict, "AS_STATED"), (verdict, "FLOORS_AS_STATED"), (verdict, "STANDS_OUT"), (borne_out, "CLOSED"),
     (verdict, "REMAINS"), (verdict, "DOUBTED"), (verdict, "HALF"), (verdict, "LISTED"), (verdict, "NEEDED"),
     (verdict, "CERTAIN"), (verdict, "EVEN"), (verdict, "LEADS"), (borne_out, "REFUTED"), (how_far, "COLOUR"),
     (how_far, "APPEARED"), (how_far, "WINDOW_S"), (diagnosis, "NEGLIGIBLE"), (diagnosis, "LOUD"),

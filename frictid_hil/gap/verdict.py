@@ -22,8 +22,6 @@ FLOORS_AS_STATED = 3.0
 """A gap below so many floors is none, too, if it means nothing in practice and every belief is as right as it says."""
 STANDS_OUT = 1.0
 """Size of all causes together, over the floor, below which nothing is named: less than what noise itself makes."""
-UNNAMED = 0.33
-"""Size of what has no name over that of all causes, from which on their names do not tell the gap: 11 % of power."""
 REMAINS = 0.2  # part of a gap that stays, from which on it may hold another cause: 4 % of its power
 DOUBTED = 0.8
 """Most that is claimed of causes that close the gap although functions without a name would describe it as well."""
@@ -79,8 +77,8 @@ def verdict(
     if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):
         return Verdict("none", ())
     new = any(gap.appeared is not None and stays(gap, REMAINS) for gap in gaps)
-    # Where what has no name is the larger part, the names tell the gap only if they close it.
-    untold = unnamed and any(stays(gap, REMAINS if generic_wins else UNNAMED) for gap in gaps)
+    # Where functions without a name describe it as well, the names tell the gap only if they close it.
+    untold = unnamed and any(stays(gap, REMAINS) for gap in gaps)
     if nothing or untold or new or any(_open(gap, negligible) for gap in gaps):
         return Verdict("unknown", named, place)
     if (varies := next((f for f in named if f.chance >= EVEN and _varies(f, channels)), None)) is not None:
