@@ -66,6 +66,7 @@ def sampled(posterior: Posterior) -> Sampled:
     levels = float(posterior.channel.level_free)
     x = np.concatenate([log.x[log.told] - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
+    form = FORM / math.sqrt(_ways(posterior, gram))
     draws = [plainest(posterior, draw, gram) for draw in posterior.draws(posterior.search(), DRAWS)]
     sizes, blurs, believed, tolerated = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(4))
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
@@ -82,7 +83,7 @@ def sampled(posterior: Posterior) -> Sampled:
         causes = {name: part for name, part in parts.items() if name and not name.startswith(FAMILY)}
         # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
         unnamed = [parts[""]] if "" in parts else []
-        for effect, net, blur in zip(causes, *_net([*causes.values(), *unnamed], gram), strict=False):
+        for effect, net, blur in zip(causes, *_net([*causes.values(), *unnamed], gram, form), strict=False):
             sizes[effect][k] = net / posterior.floor
             blurs[effect][k] = blur / posterior.floor
         for effect, (within, whole) in posterior.believed(draw, np.diag(gram)).items():
@@ -93,11 +94,23 @@ def sampled(posterior: Posterior) -> Sampled:
     return Sampled(posterior, draws, sizes, blurs, believed, tolerated, generic, explained, gram)
 
 
-def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array, Array]:
+def _ways(posterior: Posterior, gram: Array) -> float:
+    """How many ways the causes of a channel may bend its residual: participation ratio of their columns' correlations.
+
+    What a joint makes beyond a cause's form may lie in any of them, so that its part in one is 1 / sqrt(ways) of it.
+    """
+    named = [term.columns for term in posterior.channel.candidates if not term.effect.startswith(FAMILY)]
+    columns = np.unique(np.concatenate([np.zeros(0, dtype=int), *named]).astype(int))
+    own = np.sqrt(np.maximum(np.diag(gram)[columns], 1e-300))
+    correlations = gram[np.ix_(columns, columns)] / own[:, None] / own
+    return max(1.0, columns.size**2 / max(float(np.sum(correlations**2)), 1.0))
+
+
+def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array, form: float) -> tuple[Array, Array]:
     """(RMS of what each cause makes less what others take back, one-sigma of what their forms may have put on it).
 
-    A pair that more than half cancels explains nothing. A cause that moves as a larger one does is told from it by
-    their forms alone, and no joint is quite as its formula.
+    A pair that more than half cancels explains nothing. A cause that moves as another one does is told from it by
+    their forms alone, and no joint is quite as its formula: ``form`` is the share of a cause that may lie in its way.
     """
     if not parts:
         return np.zeros(0), np.zeros(0)
@@ -110,7 +123,8 @@ def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array,
     taken_back = np.where(cancels, inner, 0.0).sum(axis=1) / own
     net: Array = np.maximum(0.0, own + taken_back)
     apart = np.sqrt(np.maximum(1.0 - (inner / (own[:, None] * own)) ** 2, FORM**2))
-    lent = np.where(own > own[:, None], FORM * own / apart, 0.0)
+    lent = form * own / apart
+    np.fill_diagonal(lent, 0.0)
     return net, np.max(lent, axis=1, initial=0.0)
 
 
