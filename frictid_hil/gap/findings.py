@@ -54,6 +54,7 @@ class Sampled:
     sizes: Mapping[str, Array]
     # By cause, one-sigma of what the forms of the others may have put on it, in the same unit.
     blurs: Mapping[str, Array]
+    lent: Mapping[str, Array]  # the part of it that is expected, where those forms may be off in any way
     believed: Mapping[str, Array]  # by cause, one-sigma of its size before anything is recorded, in the same unit
     tolerated: Mapping[str, Array]  # the same of what the belief's tolerance alone allows
     generic: Array  # the same of all generic functions together
@@ -66,9 +67,9 @@ def sampled(posterior: Posterior) -> Sampled:
     levels = float(posterior.channel.level_free)
     x = np.concatenate([log.x[log.told] - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
-    form = FORM / math.sqrt(_ways(posterior, gram))
     draws = [plainest(posterior, draw, gram) for draw in posterior.draws(posterior.search(), DRAWS)]
     sizes, blurs, believed, tolerated = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(4))
+    expected = 1.0 / math.sqrt(_ways(posterior, gram))
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
 
     def size_of(parts: Sequence[tuple[np.ndarray, Array]]) -> float:
@@ -83,7 +84,7 @@ def sampled(posterior: Posterior) -> Sampled:
         causes = {name: part for name, part in parts.items() if name and not name.startswith(FAMILY)}
         # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
         unnamed = [parts[""]] if "" in parts else []
-        for effect, net, blur in zip(causes, *_net([*causes.values(), *unnamed], gram, form), strict=False):
+        for effect, net, blur in zip(causes, *_net([*causes.values(), *unnamed], gram), strict=False):
             sizes[effect][k] = net / posterior.floor
             blurs[effect][k] = blur / posterior.floor
         for effect, (within, whole) in posterior.believed(draw, np.diag(gram)).items():
@@ -91,13 +92,14 @@ def sampled(posterior: Posterior) -> Sampled:
             believed[effect][k] = math.sqrt(whole) / posterior.floor
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
-    return Sampled(posterior, draws, sizes, blurs, believed, tolerated, generic, explained, gram)
+    lent = {effect: expected * blur for effect, blur in blurs.items()}
+    return Sampled(posterior, draws, sizes, blurs, lent, believed, tolerated, generic, explained, gram)
 
 
 def _ways(posterior: Posterior, gram: Array) -> float:
     """How many ways the causes of a channel may bend its residual: participation ratio of their columns' correlations.
 
-    What a joint makes beyond a cause's form may lie in any of them, so that its part in one is 1 / sqrt(ways) of it.
+    What a joint makes beyond a cause's form may lie in any of them: 1 / sqrt(ways) of it is expected in one.
     """
     named = [term.columns for term in posterior.channel.candidates if not term.effect.startswith(FAMILY)]
     columns = np.unique(np.concatenate([np.zeros(0, dtype=int), *named]).astype(int))
@@ -106,11 +108,11 @@ def _ways(posterior: Posterior, gram: Array) -> float:
     return max(1.0, columns.size**2 / max(float(np.sum(correlations**2)), 1.0))
 
 
-def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array, form: float) -> tuple[Array, Array]:
+def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array, Array]:
     """(RMS of what each cause makes less what others take back, one-sigma of what their forms may have put on it).
 
-    A pair that more than half cancels explains nothing. A cause that moves as another one does is told from it by
-    their forms alone, and no joint is quite as its formula: ``form`` is the share of a cause that may lie in its way.
+    A pair that more than half cancels explains nothing. A cause that moves as a larger one does is told from it by
+    their forms alone, and no joint is quite as its formula.
     """
     if not parts:
         return np.zeros(0), np.zeros(0)
@@ -123,7 +125,7 @@ def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array, form: float) ->
     taken_back = np.where(cancels, inner, 0.0).sum(axis=1) / own
     net: Array = np.maximum(0.0, own + taken_back)
     apart = np.sqrt(np.maximum(1.0 - (inner / (own[:, None] * own)) ** 2, FORM**2))
-    lent = form * own / apart
+    lent = FORM * own / apart
     np.fill_diagonal(lent, 0.0)
     return net, np.max(lent, axis=1, initial=0.0)
 
@@ -176,32 +178,41 @@ def _over_channels(what: str, name: str, channels: Sequence[Sampled]) -> Array:
 
 def _sides(name: str, channels: Sequence[Sampled]) -> tuple[float, float]:
     """(Chance that a cause shows as it is told, that it shows the other way round, which only an error can)."""
-    size, blur, tolerated, believed = (
-        _over_channels(what, name, channels) for what in ("sizes", "blurs", "tolerated", "believed")
+    size, blur, lent, tolerated, believed = (
+        _over_channels(what, name, channels) for what in ("sizes", "blurs", "lent", "tolerated", "believed")
     )
-    chances = _chances(size, np.maximum(blur, FORM), tolerated, believed, channels[0].posterior.chance)
-    told, other = (float(np.mean(chance)) for chance in chances)
+    beyond = _beyond(size, np.maximum(lent, FORM), tolerated, believed, channels[0].posterior.chance)
+    within = [float(np.mean((1.0 - beyond) * c)) for c in _chances(size, np.maximum(blur, FORM), tolerated)]
+    told, other = (
+        w + float(np.mean(beyond * c))
+        for w, c in zip(within, _chances(size, np.maximum(blur, FORM), believed), strict=True)
+    )
     is_error = any(t.effect == name and not t.shape for c in channels for t in c.posterior.channel.nuisances)
     return told, other if is_error else 0.0
 
 
-def _chances(size: Array, blur: Array, tolerated: Array, believed: Array, prior: float) -> tuple[Array, Array]:
+def _beyond(size: Array, lent: Array, tolerated: Array, believed: Array, prior: float) -> Array:
+    """Chance that a cause is more than its tolerance, or nothing, and what others lend it, one a draw, (draws,).
+
+    A draw that holds it took all forms for right. ``prior`` is the chance of a cause before anything is recorded.
+    """
+    narrow, wide = tolerated**2 + lent**2, believed**2 + lent**2
+    odds = 0.5 * size**2 * (1.0 / narrow - 1.0 / wide) - 0.5 * np.log(wide / narrow)
+    chance: Array = special.expit(special.logit(prior) + odds)
+    return chance
+
+
+def _chances(size: Array, blur: Array, believed: Array) -> tuple[Array, Array]:
     """(That a cause shows as it is told, that it shows the other way round), one a draw, (draws,) each.
 
-    A draw knows the size as if all forms were right; they blur it. Two beliefs hold against that: that it is no larger
-    than its tolerance allows, and, with the prior chance of a cause, that it is as large as a cause may be.
+    A draw knows the size as if all forms were right; they blur it, and what was believed of it holds against that.
     """
-    blurred, wide = tolerated**2 + blur**2, believed**2 + blur**2
-    odds = 0.5 * size**2 * (1.0 / blurred - 1.0 / wide) - 0.5 * np.log(wide / blurred)
-    beyond: Array = special.expit(special.logit(prior) + odds)
-    told, other = np.zeros(size.size), np.zeros(size.size)
-    for chance, width in ((1.0 - beyond, tolerated), (beyond, believed)):
-        held = width**2 / (width**2 + blur**2)
-        middle, spread = held * size, np.maximum(np.sqrt(held) * blur, 1e-9)
-        told += chance * special.ndtr((middle - VISIBLE) / spread)
-        other += chance * special.ndtr((-middle - VISIBLE) / spread)
+    held = believed**2 / (believed**2 + blur**2)
+    middle, spread = held * size, np.maximum(np.sqrt(held) * blur, 1e-9)
     there = size > 0.0
-    return np.where(there, told, 0.0), np.where(there, other, 0.0)
+    told: Array = np.where(there, special.ndtr((middle - VISIBLE) / spread), 0.0)
+    other: Array = np.where(there, special.ndtr((-middle - VISIBLE) / spread), 0.0)
+    return told, other
 
 
 def _rivals(row: int, names: Sequence[str], there: np.ndarray, shown: Array) -> tuple[str, ...]:
