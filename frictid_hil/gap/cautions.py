@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Sequence
 
 import numpy as np
 
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.gap.findings import Finding
 from frictid_hil.gap.residuals import LowPass, uniform
 from frictid_hil.gap.sanity import LEAST_ROWS
 
@@ -75,11 +76,18 @@ def _sinusoid(q: Array, time_s: Array) -> tuple[float, float] | None:
     return best[1], best[2]
 
 
-def below_first_pair(effects: Collection[str], curve: FrictionCurve | None) -> str | None:
-    """The warning that a Stribeck effect deserves whose nominal curve is drawn straight below its first pair."""
-    if curve is None or "stribeck" not in effects:
+def below_first_pair(named: Sequence[Finding], curve: FrictionCurve | None) -> str | None:
+    """The warning that a Stribeck effect deserves whose nominal curve is drawn straight below its first pair.
+
+    None where its speed is known to lie above that pair: there the curve was measured.
+    """
+    found = next((f for f in named if f.effect == "stribeck"), None)
+    if curve is None or found is None:
         return None
     first = curve.measured_range_rad_s[0]
+    speed = found.parameters.get("stribeck_velocity_rad_s")
+    if speed is not None and speed.low is not None and speed.low > first:
+        return None
     return (
         f"below {first:.3g} rad/s the nominal curve is a straight line through its first pairs; where the true curve "
         "is concave there, the difference looks like a Stribeck effect: measure pairs at lower speeds first"

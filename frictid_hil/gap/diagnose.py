@@ -88,7 +88,7 @@ def diagnose(
         tolerable = {} if settled_nm(runs) <= quiet_nm else _tolerable(found, channels, gaps, nothing_nm)
         quiet = settled_nm(replay(tolerable, validation=_judged_role(logs)) if tolerable else runs) <= quiet_nm
     said = verdict(found, channels, gaps, nothing_nm, quiet)
-    if (warning := below_first_pair([f.effect for f in said.named], nominal.curve)) is not None:
+    if (warning := below_first_pair(said.named, nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if replay is not None and runs is not None and said.named:
         open_along = any(gap.channel == "plant" and stays(gap, HALF, floors=1.0) for gap in gaps)

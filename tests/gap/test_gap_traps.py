@@ -11,8 +11,11 @@ import pytest
 from scipy import signal
 
 from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.gap.cautions import below_first_pair
 from frictid_hil.gap.diagnose import diagnose
+from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet
+from frictid_hil.gap.findings import Finding
 from frictid_hil.gap.forward import nominal_model
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.replay import Controller as Loop
@@ -190,6 +193,14 @@ def test_a_true_stribeck_effect_is_named_and_carries_the_warning() -> None:
     effect = {"stribeck": {"share": 0.3, "stribeck_velocity_rad_s": 0.06, "exponent": 1.4}}
     found = diagnose(gap_sets.make(effect))
     assert found.causes[0].effect == "stribeck" and "stribeck" in found.reasons
+
+
+@pytest.mark.parametrize(("low", "warned"), [(0.15, True), (0.25, False)])
+def test_a_rise_that_lies_above_the_first_pair_was_measured_and_carries_no_warning(low: float, warned: bool) -> None:
+    speed = Value(low + 0.05, low, low + 0.1)
+    found = Finding("stribeck", 0.99, 10.0, 1.0, {"stribeck_velocity_rad_s": speed})
+    curve = FrictionCurve.through(np.array([0.2, 0.8, 1.8]), np.array([3.2, 3.7, 4.5]))
+    assert (below_first_pair([found], curve) is not None) is warned
 
 
 # -- winners within a log that lose across logs -----------------------------------------------------------------------
