@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 
 from frictid_hil.gap import noise
-from frictid_hil.gap.channel import Channel, Rows, Term
+from frictid_hil.gap.channel import FAMILY, Channel, Rows, Term
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.findings import (
     DRAWS,
     VISIBLE,
     Finding,
+    _beyond,
     _chances,
     _nearest,
     _opposed,
+    _ways,
     findings,
     parameters,
     sampled,
@@ -203,36 +205,44 @@ def test_two_delays_that_pull_the_same_way_are_one_between_them() -> None:
     assert parameters("torque_delay", channel, draw) == pytest.approx({"delay_s": 0.03})
 
 
-@pytest.mark.parametrize(
-    ("tolerated", "believed", "blur"),
-    [(0.2, 0.2, 1.0), (1.0, 1.0, 1.0), (4.0, 4.0, 1.0), (1.0, 1.0, 0.3), (0.0, 4.0, 0.5), (0.3, 3.0, 0.5)],
-)
-def test_the_chance_of_a_blurred_error_is_the_share_of_drawn_ones_that_show(
-    tolerated: float, believed: float, blur: float
-) -> None:
-    rng, prior = np.random.default_rng(5), 0.1
-    true = np.where(rng.random(4_000_000) < prior, believed, tolerated) * rng.normal(size=4_000_000)
+@pytest.mark.parametrize(("believed", "blur"), [(0.2, 1.0), (1.0, 1.0), (4.0, 1.0), (1.0, 0.3)])
+def test_the_chance_of_a_blurred_error_is_the_share_of_drawn_ones_that_show(believed: float, blur: float) -> None:
+    rng = np.random.default_rng(5)
+    true = believed * rng.normal(size=2_000_000)
     seen = true + blur * rng.normal(size=true.size)
-    for size in (0.1, 0.6, 1.2, 1.8):
+    for size in (0.1, 0.6, 1.2):
         alike = true[np.abs(seen - size) < 0.02]
-        values = (np.full(DRAWS, value) for value in (size, blur, tolerated, believed))
-        told, other = (np.mean(c) for c in _chances(*values, prior))
+        told, other = (np.mean(c) for c in _chances(*(np.full(DRAWS, value) for value in (size, blur, believed))))
         assert told == pytest.approx(np.mean(alike > VISIBLE), abs=0.02)
         assert other == pytest.approx(np.mean(alike < -VISIBLE), abs=0.02)
 
 
+@pytest.mark.parametrize(("tolerated", "believed", "lent"), [(0.0, 4.0, 0.5), (0.3, 3.0, 0.5), (1.0, 4.0, 0.2)])
+def test_the_chance_beyond_a_tolerance_is_the_share_of_drawn_ones(
+    tolerated: float, believed: float, lent: float
+) -> None:
+    rng, prior = np.random.default_rng(5), 0.1
+    beyond = rng.random(4_000_000) < prior
+    seen = np.where(beyond, np.hypot(believed, lent), np.hypot(tolerated, lent)) * rng.normal(size=beyond.size)
+    for size in (0.1, 1.2, 1.8):
+        values = (np.full(1, value) for value in (size, lent, tolerated, believed))
+        assert _beyond(*values, prior) == pytest.approx(np.mean(beyond[np.abs(seen - size) < 0.02]), abs=0.03)
+
+
+@pytest.mark.parametrize(("alike", "ways"), [(0.0, 4.0), (1.0, 1.0)])
+def test_columns_that_move_apart_are_as_many_ways_as_they_are_and_equal_ones_are_one(alike: float, ways: float) -> None:
+    candidates = [Term(name, {}, (k,), np.zeros(1), np.ones(1)) for k, name in enumerate(("a", "b", "c", "d"))]
+    nameless = Term(FAMILY + "speed", {}, (4,), np.zeros(1), np.ones(1))
+    posterior: Any = SimpleNamespace(channel=SimpleNamespace(candidates=[*candidates, nameless]))
+    size = np.array([1.0, 2.0, 3.0, 4.0, 9.0])
+    gram = (np.eye(5) + alike * (1.0 - np.eye(5))) * size[:, None] * size
+    assert _ways(posterior, gram) == pytest.approx(ways)
+
+
 def test_what_the_forms_of_others_may_have_made_is_no_error_beyond_its_tolerance() -> None:
     size, blur = np.full(DRAWS, 0.3), np.full(DRAWS, 3.0)
-    narrow, wide = (
-        sum(np.mean(c) for c in _chances(size, blur, w, w, 0.04)) for w in np.full((2, DRAWS), [[0.1], [10.0]])
-    )
+    narrow, wide = (sum(np.mean(c) for c in _chances(size, blur, np.full(DRAWS, s))) for s in (0.1, 10.0))
     assert narrow < 0.01 < 0.8 < wide
-
-
-def test_a_cause_that_the_form_of_a_larger_one_may_have_made_is_as_likely_as_any_before_the_recording() -> None:
-    size, none, wide = np.full(DRAWS, 1.0), np.zeros(DRAWS), np.full(DRAWS, 3.0)
-    blurred, plain = (sum(np.mean(c) for c in _chances(size, np.full(DRAWS, b), none, wide, 0.04)) for b in (1.0, 0.1))
-    assert blurred < 0.1 < 0.99 < plain
 
 
 @pytest.mark.parametrize(("mean", "deviation"), [(0.0, 2.0), (1.0, 0.1)])
