@@ -225,8 +225,8 @@ def test_the_chance_beyond_a_tolerance_is_the_share_of_drawn_ones(
     beyond = rng.random(4_000_000) < prior
     seen = np.where(beyond, np.hypot(believed, lent), np.hypot(tolerated, lent)) * rng.normal(size=beyond.size)
     for size in (0.1, 1.2, 1.8):
-        values = (np.full(1, value) for value in (size, lent, tolerated, believed))
-        assert _beyond(*values, prior) == pytest.approx(np.mean(beyond[np.abs(seen - size) < 0.02]), abs=0.03)
+        found = _beyond(np.full(1, size), np.full(1, lent), np.full(1, tolerated), np.full(1, believed), prior)
+        assert found == pytest.approx(np.mean(beyond[np.abs(seen - size) < 0.02]), abs=0.03)
 
 
 @pytest.mark.parametrize(("alike", "ways"), [(0.0, 4.0), (1.0, 1.0)])
