@@ -182,11 +182,9 @@ def _sides(name: str, channels: Sequence[Sampled]) -> tuple[float, float]:
         _over_channels(what, name, channels) for what in ("sizes", "blurs", "lent", "tolerated", "believed")
     )
     beyond = _beyond(size, np.maximum(lent, FORM), tolerated, believed, channels[0].posterior.chance)
-    within = [float(np.mean((1.0 - beyond) * c)) for c in _chances(size, np.maximum(blur, FORM), tolerated)]
-    told, other = (
-        w + float(np.mean(beyond * c))
-        for w, c in zip(within, _chances(size, np.maximum(blur, FORM), believed), strict=True)
-    )
+    blur = np.maximum(blur, FORM)
+    sides = zip(_chances(size, blur, tolerated), _chances(size, blur, believed), strict=True)
+    told, other = (float(np.mean((1.0 - beyond) * within + beyond * whole)) for within, whole in sides)
     is_error = any(t.effect == name and not t.shape for c in channels for t in c.posterior.channel.nuisances)
     return told, other if is_error else 0.0
 

@@ -92,7 +92,7 @@ class Posterior:
         """Nothing has been searched yet; ``library`` as above."""
         self.doubt = 1.0
         self.chance = EXPECTED / library
-        self._chance = math.log(self.chance)
+        self._log_chance = math.log(self.chance)
         self._known: dict[tuple[int, ...], Model] = {}
         self._prepare_blocks()
 
@@ -185,7 +185,7 @@ class Posterior:
         """Candidates by number of columns, so that all of one size are scored at once."""
         candidates = self.channel.candidates
         shapes = Counter(term.effect for term in candidates)
-        self._log_prior = np.array([self._chance - math.log(shapes[term.effect]) for term in candidates])
+        self._log_prior = np.array([self._log_chance - math.log(shapes[term.effect]) for term in candidates])
         self._local = [own - self._first for own in self._own[len(self.channel.nuisances) :]]
         self._blocks = {
             size: np.array([t for t, own in enumerate(self._local) if own.size == size])
@@ -224,7 +224,7 @@ class Posterior:
         gain = 0.5 * float(right @ mean) - 0.5 * float(centre @ centre)
         again = len(terms) - len({self.channel.candidates[t].effect for t in terms})
         gain -= 0.5 * float(np.linalg.slogdet(inner)[1]) - float(np.sum(self._log_prior[list(terms)]))
-        gain -= again * self._chance
+        gain -= again * self._log_chance
         start = 0
         for t in terms:
             if math.isfinite(self._low[t]) or math.isfinite(self._high[t]):
@@ -265,7 +265,7 @@ class Posterior:
                 # Two shapes of one cause make one between them; a third adds nothing.
                 between = counts[candidate.effect] == 1 and bool(candidate.shape) and t not in terms
                 between = between and not candidate.effect.startswith(FAMILY)
-                gains[t] = gains[t] - self._chance if between else -np.inf
+                gains[t] = gains[t] - self._log_chance if between else -np.inf
         return gains
 
     def _extensions(self, model: Model) -> list[int]:
