@@ -84,6 +84,7 @@ def _paths() -> list[StopPath]:
         StopPath("no heartbeat of a drive", heartbeat, _QUICK, quick, SafetyAbort),
         StopPath("a drive faults, warns (EMCY), boots up, changes mode or state", cycles, _QUICK, quick, SafetyAbort),
         StopPath("a locked joint moves; the interlock opens", cycles, _QUICK, quick, SafetyAbort),
+        StopPath("somebody else sends our commands (CANopen, MIT)", cycles, _QUICK, quick, SafetyAbort),
         StopPath(
             f"{cycle._WIRE_FAILURES} cycles fail on the bus, or bus-off",
             cycles,
@@ -151,6 +152,7 @@ def page() -> str:
             "",
             "MIT-mode actuators and bus servos have no quick stop of their own: they are told to brake. One that still",
             f"moves {wishes.STOP_NS * 1e-9:g} s later, because another sender commands it, loses its power, too.",
+            "An MIT motor that another sender is heard to command after the stop loses it at once.",
             "",
             *_servos(),
             "",

@@ -12,7 +12,7 @@ from typing import Any
 import can
 from filelock import FileLock, Timeout
 
-from frictid_hil.errors import HardwareBusy, HardwareError, UsageError
+from frictid_hil.errors import HardwareBusy, HardwareError, SafetyAbort, UsageError
 
 BusFactory = Callable[[], can.BusABC]
 
@@ -159,6 +159,16 @@ def _likely_cause(error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno == 19:
         return "there is no such CAN interface on this machine"
     return "the adapter is absent, the link is down, or an option does not suit the interface"
+
+
+def another_master(where: str, identifier: int) -> SafetyAbort:
+    """What to tell where a command came that we did not send; the identifier without flags."""
+    return SafetyAbort(
+        f"somebody else commands this drive: identifier {identifier:#05x} came with other data than ours",
+        where=where,
+        cause="a second master on the bus: a controller, a vendor's tool, or a run on another computer",
+        next_step="stop it or take it off the bus, then run `frictid-hil check`",
+    )
 
 
 class BusLock:

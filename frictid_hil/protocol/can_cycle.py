@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 
 from frictid_hil.errors import FrictidError, SafetyAbort
+from frictid_hil.protocol.can_bus import another_master
 from frictid_hil.protocol.can_line import CanLine
-from frictid_hil.protocol.driver import Clock, Feedback, JointState, SetPoint
-from frictid_hil.protocol.rows import RowDecoder
+from frictid_hil.protocol.driver import EXTENDED, FD_FRAME, Clock, Feedback, JointState, SetPoint
+from frictid_hil.protocol.rows import Command, RowDecoder
 from frictid_hil.protocol.wishes import Do, Order, Wish
 
 SETTLE_S = 1.5
@@ -34,6 +36,9 @@ class CanCycle:
         self.wishes = list(wishes)
         self._period_ns = round(1e9 / cycle_hz)
         self._window_ns = round(window * self._period_ns)
+        self._told: deque[tuple[int, bytes]] = deque(maxlen=2 * len(self.wishes))  # frames sent last
+        self._stranger: tuple[int, int] | None = None  # (joint, identifier) of a command that we did not send
+        self._stopping = False  # told to stop, because of a stranger or by ``stop``
         self.may_be_powered: tuple[str, ...] = ()  # joints that were not seen to be off when ``stop`` ended
 
     def wish(self, joint: str) -> Wish:
@@ -44,12 +49,14 @@ class CanCycle:
         """All commands, then the reports as they come.
 
         Raises:
-            SafetyAbort: a set-point is not a number; every joint was told to stop.
+            SafetyAbort: a set-point is not a number, or somebody else commands a joint; every joint was told to stop.
+                The latter is raised once; later exchanges go on, so that the stop can be watched.
             HardwareError: frames cannot be sent.
         """
         line, rows = self._line, self._rows
         for heard in line.received():
-            rows.feed(*heard)
+            self._hear(*heard)
+        self._check_stranger()
         deadline_ns = self._clock.now_ns() + self._window_ns
         refused: SafetyAbort | None = None
         frames = []
@@ -61,15 +68,16 @@ class CanCycle:
             frames.append(self._frame(at, order))
         # Only now: the first command makes all reports a cycle older, and orders go by fresh ones.
         for frame in frames:
-            rows.feed(line.send(*frame), *frame)
+            rows.feed(self._send(*frame), *frame)
         if refused is not None:
             self.quick_stop()
             raise refused
         if rows.waiting():
             for heard in line.received(deadline_ns):
-                rows.feed(*heard)
+                self._hear(*heard)
                 if not rows.waiting():
                     break
+        self._check_stranger()
         return rows.feedback
 
     def quick_stop(self) -> None:
@@ -78,7 +86,7 @@ class CanCycle:
             with contextlib.suppress(Exception):
                 wish.stop()
                 on = wish.feedback.state is JointState.ENABLED
-                self._line.send(*self._frame(at, Order(Do.BRAKE if on else Do.REST)))
+                self._send(*self._frame(at, Order(Do.BRAKE if on else Do.REST)))
 
     def stop(self) -> None:
         """Cycle until every joint is at rest and off; in the end all are told twice, for a frame may be lost.
@@ -86,8 +94,9 @@ class CanCycle:
         What they say to that counts: somebody else may have switched one on again.
 
         Raises:
-            SafetyAbort: a joint still reports power, or does not report.
+            SafetyAbort: a joint still reports power, or does not report; or somebody else began to command one.
         """
+        told, self._stopping = self._stopping, True
         for wish in self.wishes:
             wish.disable()
         set_points = [SetPoint() for _ in self.wishes]
@@ -112,13 +121,42 @@ class CanCycle:
                 where=", ".join(f"joint {name}" for name in powered),
                 next_step="switch its supply off, then look at the drive",
             )
+        if self._stranger is not None and not told:
+            raise self._another_master(*self._stranger)
+
+    def _send(self, can_id: int, data: bytes) -> int:
+        self._told.append((can_id, data))
+        return self._line.send(can_id, data)
+
+    def _hear(self, t_ns: int, can_id: int, data: bytes) -> None:
+        """A frame from outside. A command among them is an echo of our own, as some adapters give it, or a stranger's.
+
+        A joint that a stranger goes on commanding is not braked by us: it loses its power.
+        """
+        seen = self._rows.decode(can_id, data)
+        if not isinstance(seen, Command):
+            self._rows.take(t_ns, seen)
+        elif (can_id, data) not in self._told:
+            if self._stopping:
+                self.wishes[seen.joint].let_go()
+            self._stranger = self._stranger or (seen.joint, can_id)
+
+    def _check_stranger(self) -> None:
+        """Stop where somebody else commands a joint, and tell; once."""
+        if self._stranger is not None and not self._stopping:
+            self._stopping = True
+            self.quick_stop()
+            raise self._another_master(*self._stranger)
+
+    def _another_master(self, at: int, can_id: int) -> SafetyAbort:
+        return another_master(f"joint {self.wishes[at].joint.name}", can_id & ~(EXTENDED | FD_FRAME))
 
     def _all_off(self) -> None:
         """Every joint is told, and heard for one cycle; never raises ``FrictidError``."""
         for at in range(len(self.wishes)):
             with contextlib.suppress(FrictidError):
                 frame = self._frame(at, Order(Do.REST))
-                self._rows.feed(self._line.send(*frame), *frame)
+                self._rows.feed(self._send(*frame), *frame)
         with contextlib.suppress(FrictidError):
             for heard in self._line.received(self._clock.now_ns() + self._period_ns):
-                self._rows.feed(*heard)
+                self._hear(*heard)

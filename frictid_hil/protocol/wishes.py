@@ -89,6 +89,10 @@ class Wish:
         if self._target is JointState.ENABLED:
             self._target, self._stopped_ns = JointState.STOPPING, self.feedback.t_ns
 
+    def let_go(self) -> None:
+        """No power at once, in motion as well: where braking does not reach the joint."""
+        self._target, self._brake_until_ns = JointState.DISABLED, 0
+
     def lock(self) -> None:
         """Hold the present target in position mode."""
         if self.mode is not Mode.POSITION:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import can
 import pytest
 from mit_bench import robot
 
@@ -132,8 +133,9 @@ def test_where_the_bus_is_gone_every_joint_may_have_power(tmp_path: Path) -> Non
 def test_a_motor_that_somebody_else_switches_on_again_lets_go_by_its_watchdog(tmp_path: Path, family: str) -> None:
     """Its watchdog was put back to what it had been, and it kept its power for ever."""
     run = Running(tmp_path, family, {"kind": "foreign", "frames": "command", "joint": "1", "at_s": 0.0})
-    run.cycles(20)
-    with pytest.raises(SafetyAbort):
+    with pytest.raises(SafetyAbort, match="joint 1: somebody else commands"):
+        run.cycles(20)
+    with pytest.raises(SafetyAbort, match="did not come to rest"):
         run.driver.stop_cycling()
     assert run.driver.may_be_powered == ("1",)
     run.driver.close()
@@ -141,3 +143,47 @@ def test_a_motor_that_somebody_else_switches_on_again_lets_go_by_its_watchdog(tm
     assert motors["1"].timeout_ns and not motors["0"].timeout_ns
     run.driver.rack.advance(motors["1"]._now_ns + 1_000_000_000)
     assert not motors["1"].on
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_an_old_set_point_that_somebody_else_repeats_stops_all_in_the_next_cycle(tmp_path: Path, family: str) -> None:
+    """It had driven a joint beyond its limits before anybody noticed."""
+    run = Running(tmp_path, family, {"kind": "foreign", "frames": "command", "joint": "0", "at_s": 0.11})
+    start_rad = run.cycles(50)[0].position_rad
+    run.driver.unlock("0")
+    aborts, path_rad = [], []
+    for cycle in range(1, 100):
+        run.driver.clock.wait_until(run.driver.clock.now_ns() + 2_000_000)
+        try:
+            run.driver.exchange([SetPoint(position_rad=start_rad + 1e-3 * cycle, velocity_rad_s=0.5), SetPoint()])
+        except SafetyAbort as error:
+            aborts.append((cycle, str(error)))
+        path_rad.append(run.driver.rack.actuators["0"].plant.measured_position_rad - start_rad)
+    (cycle, told), *more = aborts
+    assert not more and "joint 0: somebody else commands this drive" in told
+    first_repeated = 6  # of 0.11 s; what is repeated is ours for two cycles, which nobody can tell from an echo
+    assert first_repeated <= cycle <= first_repeated + 3
+    assert min(path_rad) > -0.002 and max(path_rad) < 1e-3 * (cycle + 20)
+    run.driver.stop_cycling()
+    assert not any(motor.on for motor in run.driver.rack.actuators.values())
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_an_adapter_that_echoes_our_own_frames_is_no_second_master(
+    tmp_path: Path, family: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, heard = Running(tmp_path, family), list[can.Message]()
+    assert run.driver._line is not None
+    bus = run.driver._line._bus
+    send, recv = bus.send, bus.recv
+
+    def echoed(message: can.Message, timeout: float | None = None) -> None:
+        send(message)
+        heard.append(message)
+
+    monkeypatch.setattr(bus, "send", echoed)
+    monkeypatch.setattr(bus, "recv", lambda timeout=None: heard.pop(0) if heard else recv(timeout))
+    assert [report.age_cycles for report in run.cycles(50)] == [0, 0]
+    run.driver.quick_stop()
+    run.driver.stop_cycling()
+    assert run.driver.may_be_powered == ()

@@ -34,7 +34,7 @@ from frictid_drivers.cia402.settings import BusSettings
 from frictid_drivers.cia402.state import DISABLE_VOLTAGE, QUICK_STOP, DriveState, Target
 from frictid_hil.errors import FrictidError, HardwareError, SafetyAbort
 from frictid_hil.plan.mode import Mode
-from frictid_hil.protocol.can_bus import BUS_ERRORS
+from frictid_hil.protocol.can_bus import BUS_ERRORS, another_master
 from frictid_hil.protocol.can_frames import BUS_OFF, CONTROLLER_STATES, Heard, frames_of
 from frictid_hil.protocol.driver import FD_FRAME, Clock, Feedback, FrameSink, SetPoint, by_the_batch
 
@@ -357,7 +357,8 @@ class Cycle:
             at, self._other_kind = self._other_kind, None
             self._end(self._other_frames(at))
         if self._stranger is not None:
-            self._end(self._other_master(*self._stranger))
+            at, cob_id = self._stranger
+            self._end(another_master(self._wheres[at], cob_id))
         alive = decoder.all_alive(now_ns - self._drive_timeout_ns)
         for at, axis in enumerate(self._axes):
             if not alive:
@@ -385,14 +386,6 @@ class Cycle:
             cause=f"CAN FD is {'not ' if self._fd else ''}switched on in this drive",
             next_step="switch it with the vendor's tool, name the object that does as `fd_object` in the joint's "
             "options, or change `fd`",
-        )
-
-    def _other_master(self, at: int, cob_id: int) -> SafetyAbort:
-        return SafetyAbort(
-            f"somebody else commands this drive: identifier {cob_id:#05x} came with other data than ours",
-            where=self._wheres[at],
-            cause="a second master on the bus: a controller, a vendor's tool, or a run on another computer",
-            next_step="stop it or take it off the bus, then run `frictid-hil check`",
         )
 
     def _alarm(self, at: int, what: str) -> None:

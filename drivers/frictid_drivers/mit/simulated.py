@@ -171,13 +171,18 @@ class FaultyMotors(DeviceFaults):
         super().__init__(faults, rack.actuators, rack.advance)
         self._rack, self._answers = rack, list[Frame]()
         self._muted: set[str] = set()
+        strangers = [fault for fault in faults if fault.kind == "foreign" and fault.frames == "command"]
+        self._commanded_by_others = {joint for fault in strangers for joint in fault.joints}
 
     def receive(self, can_id: int, data: bytes) -> Iterable[Frame]:
         """A frame of the host; what comes back now, and what was late and has come meanwhile."""
         joint = self._rack.meant(can_id, data)
         if joint is not None and joint not in self._muted:
-            for due_ns, out_id, out in self._spoilt("command", joint, can_id, data):
+            for number, (due_ns, out_id, out) in enumerate(self._spoilt("command", joint, can_id, data)):
                 self._at(due_ns, partial(self._to_motor, joint, out_id, out))
+                if number and joint in self._commanded_by_others:
+                    # Whoever sent it, the host hears it as well as the motor.
+                    self._at(due_ns, partial(self._answers.append, (out_id, out)))
         answers = list(self._answers)
         self._answers.clear()
         return answers
