@@ -1,6 +1,6 @@
 """The cyclic loop beside canopen's own PDO variables, between two processes, in one run; with an empty loop beside it.
 
-    python benchmarks/cycle.py [--seconds 20] [--blocks 10] [--bound]
+    python benchmarks/cycle.py [--seconds 20] [--blocks 10] [--bound] [--loop JOINTS HZ]
 
 The drives are frames that were packed beforehand: a process that answers every SYNC and computes nothing, so that the
 host's own time shows. Host and drives are joined by a local socket. Round trips follow each other without a pause:
@@ -10,7 +10,7 @@ and received by the socket's own calls take turns in blocks: the last is what wi
 a call of the system.
 Then the loop that moves real robots (deadline, exchange, supervisor, sample and frame rings) at a rate, and before and
 after it a loop that does nothing but wait for its deadlines: what it misses is the computer's. ``--bound`` compares it
-instead with itself bound to a single core, by turns.
+instead with itself bound to a single core, by turns. ``--loop 1 1000 --seconds 60`` runs that loop alone.
 """
 
 from __future__ import annotations
@@ -467,12 +467,28 @@ def alone(function: Callable[..., Any], *arguments: object) -> Any:
         return pool.apply(function, arguments)
 
 
+LOOP_HEAD = (
+    "| Joints | Rate, Hz | Bus load, % | Late by, us: p50 / p99 / p99.9 / most | Missed | Share of a core, % |\n"
+    "|---|---|---|---|---|---|"
+)
+
+
+def print_loop(active: int, cycle_hz: float, seconds: float) -> None:
+    """Our loop, and the empty one before and after it."""
+    found = layout_of(active, cycle_hz).load()
+    before, loop, after = alone(timed, active, float(cycle_hz), seconds)
+    fits = "" if found.average_percent <= 80.0 else " (no wire carries this)"
+    print(f"| {active} | {cycle_hz} | {found.average_percent:.0f}{fits} | {loop} |")
+    print(f"| empty, before | {cycle_hz} | - | {before} |\n| empty, after | {cycle_hz} | - | {after} |", flush=True)
+
+
 def main() -> None:
     """Both tables."""
     asked = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     asked.add_argument("--seconds", type=float, default=20.0, help="of each loop")
     asked.add_argument("--blocks", type=int, default=10, help="of round trips")
     asked.add_argument("--bound", action="store_true", help="compare our loop on one core with itself on any")
+    asked.add_argument("--loop", nargs=2, type=int, metavar=("JOINTS", "HZ"), help="this loop alone")
     asked.add_argument("--answer", nargs=4, metavar=("CHANNEL", "ACTIVE", "HZ", "AT_ONCE"), help=argparse.SUPPRESS)
     options = asked.parse_args()
     if options.answer:
@@ -484,6 +500,10 @@ def main() -> None:
     if options.bound:
         compare_bound_and_free(options.seconds, options.blocks)
         return
+    if options.loop:
+        print(LOOP_HEAD)
+        print_loop(*options.loop, options.seconds)
+        return
     print("| Joints | Ours, us | Stock canopen, us | On one core, us | Wire, us | Stock / ours | On one core / ours |")
     print("|---|---|---|---|---|---|---|")
     for active in ACTIVE:
@@ -491,18 +511,10 @@ def main() -> None:
         times = " | ".join(f"{np.median(one):.0f}" for one in (ours, stock, kept, wire))
         ratios = (f"{np.median(one):.1f} ({one.min():.1f} .. {one.max():.1f})" for one in (stock / ours, kept / ours))
         print(f"| {active} | {times} | {' | '.join(ratios)} |", flush=True)
-    print("\n| Joints | Rate, Hz | Bus load, % | Late by, us: p50 / p99 / p99.9 / most | Missed | Share of a core, % |")
-    print("|---|---|---|---|---|---|")
+    print("\n" + LOOP_HEAD)
     for active in ACTIVE:
         for cycle_hz in RATES_HZ:
-            found = layout_of(active, cycle_hz).load()
-            before, loop, after = alone(timed, active, float(cycle_hz), options.seconds)
-            fits = "" if found.average_percent <= 80.0 else " (no wire carries this)"
-            print(f"| {active} | {cycle_hz} | {found.average_percent:.0f}{fits} | {loop} |")
-            print(
-                f"| empty, before | {cycle_hz} | - | {before} |\n| empty, after | {cycle_hz} | - | {after} |",
-                flush=True,
-            )
+            print_loop(active, cycle_hz, options.seconds)
 
 
 if __name__ == "__main__":
