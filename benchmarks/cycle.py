@@ -502,7 +502,8 @@ def main() -> None:
         return
     if options.loop:
         print(LOOP_HEAD)
-        print_loop(*options.loop, options.seconds)
+        active, cycle_hz = options.loop
+        print_loop(active, cycle_hz, options.seconds)
         return
     print("| Joints | Ours, us | Stock canopen, us | On one core, us | Wire, us | Stock / ours | On one core / ours |")
     print("|---|---|---|---|---|---|---|")
