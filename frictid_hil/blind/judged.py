@@ -26,7 +26,9 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
     cases = [(t, Answer.from_json(documents.get(n, absent)), documents.get(n, absent)) for n, t in truths.items()]
     wrong = [(t, a) for t, a, _ in cases if t["kind"] in ("tolerance", "single", "double")]
     visible = [(t, a) for t, a in wrong if t["size_ratio"] >= VISIBLE]
-    named = [(t, effect, chance) for t, a, _ in cases if a.named for effect, chance in a.causes]
+    every = [(t, effect, chance) for t, a, _ in cases if a.named for effect, chance in a.causes]
+    # Naming what is neither there nor not is neither right nor wrong.
+    named = [(t, effect, chance) for t, effect, chance in every if _there(t, effect) or effect not in t["neutral"]]
     # A first cause that is neither there nor not is no mistake.
     sure = [not _there(t, a.first) and a.first not in t["neutral"] for t, a, _ in cases if a.confidence >= CONFIDENT]
     off = [(t, a) for t, a in visible if LEVEL in t["main"]]
@@ -58,6 +60,8 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
         "parameters": counted(held for t, _, d in cases for held in _held(t, d)),
         "brier": float(np.mean([(c - _there(t, e)) ** 2 for t, e, c in named])) if named else None,
         "calibration_error": _calibration_error([(c, _there(t, e)) for t, e, c in named]),
+        "calibration_error_neutral_as_wrong": _calibration_error([(c, _there(t, e)) for t, e, c in every]),
+        "causes": {"judged": len(named), "neutral": len(every) - len(named)},
         "confusion": _confusion([(t, a) for t, a, _ in cases]),
         "seconds": {n: s for n, s in times([a.seconds for _, a, _ in cases]).items() if n != "worst"},
         "misses": [
@@ -96,8 +100,9 @@ def page(result: Mapping[str, Any]) -> str:
     lines += [
         "",
         f"Brier score of named causes {_told(scores['brier'])}, expected calibration error "
-        f"{_told(scores['calibration_error'])}; median of processor time {_told(scores['seconds']['median'])} s; "
-        f"errors {len(scores['errors'])}.",
+        f"{_told(scores['calibration_error'])} (with neutral causes as wrong "
+        f"{_told(scores['calibration_error_neutral_as_wrong'])}); median of processor time "
+        f"{_told(scores['seconds']['median'])} s; errors {len(scores['errors'])}.",
         "",
         "| missed | truth | answer | confidence | floors |",
         "|---|---|---|---|---|",

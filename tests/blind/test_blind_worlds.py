@@ -122,9 +122,12 @@ def test_scores_count_what_they_say() -> None:
     assert (scores["sure_and_wrong"]["right"], scores["sure_and_wrong"]["of"]) == (1, 7)
     assert scores["none"]["right"] == 1 and scores["outside"]["rate"] == 1.0
     assert (scores["parameters"]["right"], scores["parameters"]["of"]) == (1, 1)
-    # Named: 0.95 right, 0.95 wrong, 0.99 wrong (not there), 0.55 tied.
-    assert scores["brier"] == pytest.approx((0.05**2 + 0.95**2 + 0.99**2 + 0.45**2) / 4)
-    assert scores["calibration_error"] == pytest.approx((abs(0.95 + 0.95 + 0.99 - 1.0) + abs(0.55 - 1.0)) / 4)
+    # Named: 0.95 right, 0.95 wrong, 0.99 neither (neutral), 0.55 tied.
+    assert scores["causes"] == {"judged": 3, "neutral": 1}
+    assert scores["brier"] == pytest.approx((0.05**2 + 0.95**2 + 0.45**2) / 3)
+    assert scores["calibration_error"] == pytest.approx((abs(0.95 + 0.95 - 1.0) + abs(0.55 - 1.0)) / 3)
+    as_wrong = scores["calibration_error_neutral_as_wrong"]
+    assert as_wrong == pytest.approx((abs(0.95 + 0.95 + 0.99 - 1.0) + abs(0.55 - 1.0)) / 4)
     assert "| wrong | stribeck | backlash |" in judged.page(
         {"world": "wide", "cases": 7, "seed": 1, "truth_sha256": "", "code_sha256": "",
          "scores": {**scores, "misses": [dict(m, case="wrong") for m in scores["misses"][:1]]}}
