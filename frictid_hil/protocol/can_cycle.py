@@ -96,7 +96,7 @@ class CanCycle:
         Raises:
             SafetyAbort: a joint still reports power, or does not report; or somebody else began to command one.
         """
-        told, self._stopping = self._stopping, True
+        alarmed, self._stopping = self._stopping, True
         for wish in self.wishes:
             wish.disable()
         set_points = [SetPoint() for _ in self.wishes]
@@ -121,7 +121,7 @@ class CanCycle:
                 where=", ".join(f"joint {name}" for name in powered),
                 next_step="switch its supply off, then look at the drive",
             )
-        if self._stranger is not None and not told:
+        if self._stranger is not None and not alarmed:
             raise self._another_master(*self._stranger)
 
     def _send(self, can_id: int, data: bytes) -> int:
