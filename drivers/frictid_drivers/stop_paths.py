@@ -109,7 +109,10 @@ def _servos() -> list[str]:
         f"servo that is silent within {1e3 * question_s:g} ms more. Where no word reaches a servo:",
         "",
         f"- **Dynamixel** lets go by its bus watchdog, {1e3 * _LINE.watchdog_s:g} ms after it last heard anything on",
-        "  the line, a question to another servo included.",
+        "  the line, a question to another servo included. One that followed a current is asked whether it holds a",
+        f"  position now, and told again; where it does not say so, nothing is sent from {1e3 * servos._OBEYS_S:g} ms "
+        "after the stop on,",
+        "  until the watchdog has struck.",
         "- **Feetech** has no watchdog. It goes on to its last goal and holds it **with power** until its supply is",
         "  switched off; the last words of the run name it and say so.",
         "",

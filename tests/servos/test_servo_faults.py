@@ -204,6 +204,66 @@ def test_a_servo_that_is_not_seen_to_be_off_is_named(model: str, lost: dict[str,
     assert [run.servo(joint).on for joint in named] == [not watched] * len(named)
 
 
+def stopped_under_torque(*faults: dict[str, Any]) -> tuple[Running, int]:
+    """One joint driven by a current, then a stop as the runner makes it; returns the bench and when that was (ns)."""
+    run = Running("XL330-M288", *faults)
+    run.cycles(20)
+    run.driver.enable(FIRST, Mode.TORQUE)
+    run.cycles(20, torque_nm=0.3)
+    stopped_ns = run.driver.clock.now_ns()
+    run.driver.quick_stop()
+    return run, stopped_ns
+
+
+def test_a_servo_that_hears_no_stop_under_a_current_loses_its_power_by_its_watchdog() -> None:
+    """Our questions reached it, and so it drove on for 1.1 s: each of them feeds its bus watchdog."""
+    run, stopped_ns = stopped_under_torque({"kind": "drop", "frames": "write", "at_s": 0.19})
+    servo, clock = run.servo(FIRST), run.driver.clock
+    with pytest.raises(HardwareError, match="a stop is not followed") as told:
+        run.cycles(40, torque_nm=0.3)
+    assert "servo 1" in str(told.value) and servo.on
+    asked_ns = clock.now_ns()
+    run.driver.quick_stop()
+    with pytest.raises(HardwareError, match="a stop is not followed"):
+        run.cycles(1)
+    run.driver.close()
+    assert not servo.on and servo._heard_ns >= asked_ns + 200_000_000, "it was spoken to before its watchdog struck"
+    assert run.driver.may_be_powered == (FIRST, SECOND)
+    assert asked_ns - stopped_ns <= 110_000_000
+
+
+def test_a_servo_that_may_be_under_a_current_is_stopped_like_one_that_is() -> None:
+    """On the way to position mode its writes were lost; the host took it to be in position mode, and it drove on."""
+    run = Running("XL330-M288", {"kind": "drop", "frames": "write", "at_s": 0.19})
+    run.cycles(20)
+    run.driver.enable(FIRST, Mode.TORQUE)
+    run.cycles(20, torque_nm=0.3)
+    servo = run.servo(FIRST)
+    with pytest.raises(HardwareError, match="does not take operating mode 3"):
+        run.driver.enable(FIRST, Mode.POSITION)
+    begun_ns = run.driver.clock.now_ns()
+    run.driver.quick_stop()
+    with pytest.raises(HardwareError, match="a stop is not followed"):
+        run.cycles(40)
+    clock = run.driver.clock
+    clock.wait_until(begun_ns + 320_000_000)
+    stood_rad = servo.plant.position_rad
+    clock.wait_until(begun_ns + 400_000_000)
+    assert not servo.on and abs(servo.plant.position_rad - stood_rad) < 5e-3
+
+
+def test_a_stop_whose_first_words_are_lost_is_told_again() -> None:
+    run, _ = stopped_under_torque({"kind": "drop", "frames": "write", "at_s": 0.1995, "count": 30})
+    run.cycles(60)
+    servo = run.servo(FIRST)
+    stood_rad = servo.plant.position_rad
+    run.cycles(20)
+    assert servo.on and servo.memory[servo.mine.model.registers.mode] == servo.mine.model.registers.position_mode
+    assert abs(servo.plant.position_rad - stood_rad) < 1e-3
+    run.driver.stop_cycling()
+    assert run.driver.may_be_powered == ()
+
+
 @pytest.mark.parametrize("count", [8, 100])
 def test_lost_writes_do_not_keep_a_joint_under_power(count: int) -> None:
     """It answered all the time; after three words that were lost it was given up, and kept its power."""

@@ -46,6 +46,8 @@ LEAST_HZ = 200.0
 _SETTLE_S = 1.5
 _BUSIEST = 0.45  # share of a cycle that the line may take: the reading begins in its middle
 _WATCHDOG_STEP_S = 0.02
+_OBEYS_S = 0.1
+"""A servo that a stop takes out of current mode says so in this time; else we are silent until its watchdog struck."""
 _INSIST_S, _AGAIN_S = 0.5, 0.01
 """A servo that is not seen to be off is told so for this long, at such intervals, silent or not."""
 
@@ -93,6 +95,8 @@ class ServoDriver:
         self._rows: RowDecoder | None = None
         self.may_be_powered: tuple[str, ...] = ()
         self._cycle_hz = 0.0
+        self._stopped_ns: int | None = None
+        self._silent_until_ns = 0
 
     # -- reaching them ------------------------------------------------------------------------------------------
 
@@ -230,6 +234,7 @@ class ServoDriver:
             raise HardwareError("start_cycling before configure")
         getattr(self.clock, "restart", lambda: None)()
         line.heard = rows.feed
+        self._stopped_ns, self._silent_until_ns = None, 0
         self._arm_watchdog(self._line_settings.watchdog_s, self._servos)
 
     def enable(self, joint: str, mode: Mode) -> None:
@@ -246,6 +251,7 @@ class ServoDriver:
                 next_step="identify it, and let it track: `compensate --task track --drive-mode position`",
             )
         servo = self._servo(joint)
+        self._stopped_ns = None
         servo.wish.enable(mode)
         servo.take_mode(mode)
 
@@ -268,12 +274,14 @@ class ServoDriver:
 
         Raises:
             SafetyAbort: a set-point is not a number; every joint was told to hold.
-            HardwareError: the port is gone.
+            HardwareError: the port is gone, or a stop is not followed.
         """
         line, rows = self._open_line(), self._rows
         if rows is None:
             raise HardwareError("exchange before configure")
         begun_ns, period_ns = self.clock.now_ns(), 1e9 / self._cycle_hz
+        if begun_ns < self._silent_until_ns:
+            raise _not_followed(self._servos)
         for _ in line.received(begun_ns):  # late answers
             pass
         registers = self._registers
@@ -284,6 +292,8 @@ class ServoDriver:
         for address, each in told.items():
             if each:
                 line.tell(address, each)
+        if self._stopped_ns is not None:
+            self._see_stopped(begun_ns + round(period_ns / 2))
         self.clock.wait_until(begun_ns + round(period_ns / 2))
         line.send(self._wire.sync_read([mine.id for mine in self._joints], registers.block, registers.block_bytes))
         for _ in line.received(begun_ns + round(0.95 * period_ns)):
@@ -297,8 +307,10 @@ class ServoDriver:
 
     def quick_stop(self) -> None:
         """Every joint holds the goal that it has, or where it was last seen; never raises."""
-        if self._line is None:
+        if self._line is None or self.clock.now_ns() < self._silent_until_ns:
             return
+        if self._stopped_ns is None:
+            self._stopped_ns = self.clock.now_ns()
         goals = {servo.mine.id: goal for servo in self._servos if (goal := servo.stop()) is not None}
         with contextlib.suppress(Exception):
             if goals:
@@ -312,6 +324,7 @@ class ServoDriver:
         """
         if not self._servos:
             return
+        self.clock.wait_until(self._silent_until_ns)
         try:
             self._settle()
         finally:
@@ -376,6 +389,30 @@ class ServoDriver:
             for value in dict.fromkeys((b"\0", self._watchdog(seconds))):
                 self._open_line().tell(self._registers.watchdog, {servo.mine.id: value for servo in servos})
 
+    def _see_stopped(self, until_ns: int) -> None:
+        """Servos that followed currents must say that they hold a position now; who does not is told again.
+
+        Every packet feeds their bus watchdogs, a question, too. So in the end nothing is sent until these have struck.
+        """
+        waiting = [servo for servo in self._servos if servo.may_follow_currents]
+        if not waiting:
+            return
+        line, now_ns = self._open_line(), self.clock.now_ns()
+        if not self._unwatched and now_ns > (self._stopped_ns or 0) + round(_OBEYS_S * 1e9):
+            silence_s = self._line_settings.watchdog_s + 2 * _WATCHDOG_STEP_S
+            self._stopped_ns, self._silent_until_ns = None, now_ns + round(silence_s * 1e9)
+            raise _not_followed(waiting)
+        line.send(self._wire.sync_read([servo.mine.id for servo in waiting], self._registers.mode, 1))
+        for packet in line.received(until_ns):
+            for servo in waiting:
+                if servo.operating is not None:
+                    servo.operating.answered(packet)
+            if not any(servo.may_follow_currents for servo in waiting):
+                return
+        for servo in waiting:
+            if servo.may_follow_currents:
+                servo.leave_currents()
+
     def _settle(self) -> None:
         """Cycle until every joint stands and was told to let go."""
         for servo in self._servos:
@@ -419,3 +456,12 @@ class ServoDriver:
         with contextlib.suppress(FrictidError):
             return self._open_line().put(servo.mine.id, self._registers.torque, b"\0")
         return False
+
+
+def _not_followed(servos: Sequence[Servo]) -> HardwareError:
+    return HardwareError(
+        "a stop is not followed; nothing is sent until the bus watchdog has taken the power",
+        where=", ".join(f"servo {servo.mine.id}" for servo in servos if servo.may_follow_currents),
+        cause="it hears questions, but no writes",
+        next_step="keep away from the joint; switch its supply off",
+    )

@@ -14,6 +14,7 @@ import math
 
 from frictid_drivers.servos.line import Line
 from frictid_drivers.servos.logs import to_bytes
+from frictid_drivers.servos.packets import Packet
 from frictid_drivers.servos.settings import JointSettings
 from frictid_hil.errors import HardwareError
 
@@ -30,7 +31,7 @@ class OperatingMode:
     """The mode of one servo, in position mode now; to where it shall hold it goes no faster than ``most_rad_s``.
 
     Raises:
-        HardwareError: it does not answer, or did not take another mode and has no power now.
+        HardwareError: it does not answer, or did not take another mode.
     """
 
     def __init__(self, line: Line, mine: JointSettings, most_rad_s: float) -> None:
@@ -39,6 +40,7 @@ class OperatingMode:
         by_time = line.ask(mine.id, _DRIVE_MODE, 1)[0] & _BY_TIME
         self._slow = _WAY_MS if by_time else max(1, math.floor(most_rad_s / _PROFILE_RAD_S))
         self._slowed = False
+        self.holds_positions = True  # as it was read back last
 
     def take_currents(self, goal: int, *, powered: bool) -> None:
         """Current mode, beginning with this goal; under power if it was."""
@@ -53,6 +55,11 @@ class OperatingMode:
         self._restore()
         if powered and goal is not None:
             self._hold(goal)
+
+    def answered(self, packet: Packet) -> None:
+        """Its answer to the question which mode it is in."""
+        if packet.id == self._mine.id and len(packet.data) == 1:
+            self.holds_positions = packet.data[0] == self._registers.position_mode
 
     def stop(self, goal: int | None) -> None:
         """Hold a position at once; waits for no answer.
@@ -87,12 +94,15 @@ class OperatingMode:
     def _change(self, mode: int, powered: bool) -> None:
         if powered:
             self._tell(self._registers.torque, _OFF)
+        self.holds_positions = False
         if not self._line.put(self._mine.id, self._registers.mode, bytes([mode])):
             raise HardwareError(
-                f"does not take operating mode {mode}; it has no torque now",
+                f"does not take operating mode {mode}",
                 where=f"servo {self._mine.id}",
+                cause="it does not hear writes, or kept its torque, which locks the register",
                 next_step="look at its operating mode with the maker's tool",
             )
+        self.holds_positions = mode == self._registers.position_mode
 
     def _restore(self) -> None:
         for address, data in self._kept.items():

@@ -86,14 +86,24 @@ class Servo:
         self.wish.stop()
         if not self._powered:
             return None
-        if self.figures.takes_currents and self.operating is not None:
-            with contextlib.suppress(Exception):
-                self.operating.stop(self._seen)
+        if self.may_follow_currents:
+            self.leave_currents()
         if self._goal is not None and self._seen is not None:
             far = abs(self._goal - self._seen) > _FAR_S * self._most_counts_s
             self._goal = (self._goal + self._seen) // 2 if far else self._goal
         goal = self._aim(math.nan)
         return None if goal is None else to_bytes(goal, self.mine.model.registers.goal_bytes, self.mine.model)
+
+    @property
+    def may_follow_currents(self) -> bool:
+        """Under power, and not known to be in position mode."""
+        return self._powered and self.operating is not None and not self.operating.holds_positions
+
+    def leave_currents(self) -> None:
+        """Hold where it was last seen, whatever it followed."""
+        if self.operating is not None:
+            with contextlib.suppress(Exception):
+                self.operating.stop(self._seen)
 
     def take_mode(self, mode: Mode) -> None:
         """Another operating mode, with the current or at the place of now."""
