@@ -64,11 +64,11 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
     if not refuted:
         return (_doubted(said) if kept and not read and open_still else said), None
     stands = [f for f in said.named if f.effect not in refuted]
-    falls = [replace(f, chance=min(f.chance, REFUTED)) for f in said.named if f.effect in refuted]
+    falls = [f.at_most(REFUTED) for f in said.named if f.effect in refuted]
     if said.word != "unknown" and said.named[0].effect not in refuted:
         return replace(said, named=(*stands, *falls)), _told(kept, refuted, loop, gap_nm)
     stands.sort(key=lambda f: kept.index(f.effect) if f.effect in kept else len(kept))
-    stands = [replace(f, chance=min(f.chance, DOUBTED)) for f in stands]
+    stands = [f.at_most(DOUBTED) for f in stands]
     if kept:
         stands[0], gap_nm = _refined(stands[0], {name: values[name] for name in kept}, loop, gap_nm)
     told = _told(kept, refuted, loop, gap_nm)
@@ -102,7 +102,7 @@ def _rescued(said: Verdict, values: Effects, loop: Loop, gap_nm: float) -> tuple
 
 def _doubted(said: Verdict) -> Verdict:
     """What describes the torque along the motion, and leaves half of the closed loop's gap, is less than sure."""
-    return replace(said, named=tuple(replace(f, chance=min(f.chance, DOUBTED)) for f in said.named))
+    return replace(said, named=tuple(f.at_most(DOUBTED) for f in said.named))
 
 
 def _of_the_drive(cause: Finding) -> bool:

@@ -102,7 +102,7 @@ def diagnose(
 
 def _closed(channels: Sequence[Sampled], named: Sequence[Finding]) -> list[Closed]:
     """The gap of each channel without and with the causes that are likelier there than not."""
-    return [closed(c, [f.effect for f in named if f.chance >= UNDECIDED]) for c in channels]
+    return [closed(c, [f.effect for f in named if f.confidence >= UNDECIDED]) for c in channels]
 
 
 def _channels(
@@ -153,7 +153,7 @@ def _with_readings(
         )
         told = {form.parameter: Value(value, 0.95 * value, 1.05 * value)}
         others = [f for f in found if f.effect != name]
-        found = [*others, Finding(name, READ, max(size, 1.0), 0.0, told, (), READ_DIRECTLY)]
+        found = [*others, Finding(name, READ, READ, max(size, 1.0), 0.0, told, (), READ_DIRECTLY)]
     return sorted(found, key=lambda f: -f.size)
 
 
@@ -233,7 +233,7 @@ def _loop(
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:
     """The verdict, no surer than the motion and the logs allow."""
     if "stribeck" in reasons:
-        capped = (replace(f, chance=min(f.chance, UNDECIDED)) if f.effect == "stribeck" else f for f in said.named)
+        capped = (f.at_most(UNDECIDED) if f.effect == "stribeck" else f for f in said.named)
         said = replace(said, named=tuple(capped))
     open_question = "motion" in reasons or "sinusoid" in reasons or not judged_apart
     if said.word != "explained" or not open_question:
@@ -241,15 +241,15 @@ def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> 
     # What the motion can tell comes first, as sure as it is; the others may stand for one another.
     told = [f for f in said.named if "motion" in reasons and f.effect not in ALIKE_ONE_WAY and judged_apart]
     others = [f for f in said.named if f not in told]
-    lowered = [*told, *(replace(f, chance=min(f.chance, UNDECIDED)) for f in others)]
+    lowered = [*told, *(f.at_most(UNDECIDED) for f in others)]
     for k, one in enumerate(list(lowered) if "sinusoid" in reasons else []):
         partner = ALIKE_ON_A_SINUSOID.get(one.effect)
         if partner is None:
             continue
         rivals = tuple(r for r in one.rivals if r != partner)
-        lowered[k] = replace(one, chance=min(one.chance, TIED), rivals=(partner, *rivals))
+        lowered[k] = replace(one.at_most(TIED), rivals=(partner, *rivals))
         if partner not in {f.effect for f in lowered}:
-            lowered.append(Finding(partner, TIED, 0.0, 0.0, {}, (one.effect,), one.where))
+            lowered.append(Finding(partner, TIED, TIED, 0.0, 0.0, {}, (one.effect,), one.where))
     return Verdict("ambiguous", tuple(lowered), said.place)
 
 
@@ -267,7 +267,7 @@ def _told(
     if replay is None:
         reasons["forward_torque_nm"] = why_not(experiments) or ""
         reasons.setdefault("forward_position_rad", reasons["forward_torque_nm"])
-    effects = {f.effect: {n: v.value for n, v in f.parameters.items()} for f in said.named if f.chance >= UNDECIDED}
+    effects = {f.effect: {n: v.value for n, v in f.parameters.items()} for f in said.named if f.confidence >= UNDECIDED}
     applied = said.word == "explained"
     runs: dict[str, Mapping[str, Replayed]] = {}
     if replay is not None and bare is not None:
@@ -332,7 +332,7 @@ def _causes(said: Verdict, channels: Sequence[Sampled], gaps: Sequence[Closed]) 
     return tuple(
         Cause(
             effect=f.effect,
-            confidence=round(f.chance if said.word != "unknown" else min(f.chance, 0.4), 3),
+            confidence=round(f.confidence if said.word != "unknown" else min(f.confidence, 0.4), 3),
             parameters=f.parameters if said.word != "unknown" else {},
             confusable_with=f.rivals,
             gap_closed_percent=round(100.0 * share * f.size**2 / total, 2) if total > 0.0 else None,
@@ -361,7 +361,7 @@ def _next(
 ) -> NextExperiment | None:
     if said.word != "ambiguous":
         return None
-    open_ones = [f for f in said.named if f.chance <= DOUBTED] or list(said.named)
+    open_ones = [f for f in said.named if f.confidence <= DOUBTED] or list(said.named)
     first = open_ones[0]
     others = [*first.rivals, *(f.effect for f in (*open_ones[1:], *said.named) if f is not first)]
     others += [*either_way(channels), first.effect]
@@ -372,8 +372,8 @@ def _next(
 def _summary(name: str, said: Verdict, there: str, gaps: Sequence[Closed], loop: str | None) -> str:
     if said.word == "none":
         return f"{name}: no gap beyond noise and what counts as none."
-    likely = [f for f in said.named if f.chance >= UNDECIDED] or said.named
-    effects = ", ".join(f"{f.effect} ({f.chance:.2f})" for f in likely)
+    likely = [f for f in said.named if f.confidence >= UNDECIDED] or said.named
+    effects = ", ".join(f"{f.effect} ({f.confidence:.2f})" for f in likely)
     place = f"{there}; " if there else ""
     if said.word == "unknown":
         part = f"{effects} explain a part, the rest " if effects else "it "

@@ -21,6 +21,8 @@ from frictid_hil.simulation.effects import all_effects
 DRAWS = 400  # samples of each channel's posterior: a chance is known to 0.025
 VISIBLE = 0.5
 """Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
+ABSENT = 0.2
+"""Size, over the floor, below which a cause is absent: it adds a fiftieth. Between the two it is neither."""
 ALIKE = 0.05  # chance of another cause in the place of one from which the two are called confusable
 EVEN = 0.5  # chance below which a cause is likelier not there
 SIDED = 0.75
@@ -35,13 +37,18 @@ class Finding:
     """One cause."""
 
     effect: str  # its name
-    chance: float  # that it shows
+    chance: float  # that it shows; decides what is said
+    confidence: float  # the same where it either shows or is absent; this is told
     size: float  # RMS of what it makes of the residual, over the noise floor; root mean square over the draws
     leads: float  # chance that it is the largest cause
     # Medians with 95 % intervals; empty where only its size is known.
     parameters: Mapping[str, Value] = field(default_factory=dict)
     rivals: tuple[str, ...] = ()  # causes that stand in its place in other draws
     where: str = ""  # name of the channel in which it shows most
+
+    def at_most(self, bound: float) -> Finding:
+        """The same cause, no surer than this."""
+        return replace(self, chance=min(self.chance, bound), confidence=min(self.confidence, bound))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,11 +152,13 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
         if not there.any() or told < SIDED * (told + other):
             continue
         values = _values(name, channels)
+        most = SURE if values else UNTOLD
         home = max(channels, key=lambda c: float(np.mean(c.sizes.get(name, np.zeros(1)) ** 2)))
         result.append(
             Finding(
                 name,
-                min(SURE if values else UNTOLD, told + other),
+                min(most, told + other),
+                min(most, _confidence(name, channels)),
                 math.sqrt(float(np.mean(shown[row] ** 2))),
                 float(leads[row]),
                 values,
@@ -177,16 +186,31 @@ def _over_channels(what: str, name: str, channels: Sequence[Sampled]) -> Array:
 
 
 def _sides(name: str, channels: Sequence[Sampled]) -> tuple[float, float]:
-    """(Chance that a cause shows as it is told, that it shows the other way round, which only an error can)."""
+    """(Chance that a cause shows as it is told, that it shows the other way round, which only an error can).
+
+    The most that other causes' forms may have put on it counts as its doubt: this decides what is said at all.
+    """
+    told, other, _ = _three(name, channels, "blurs")
+    return told, other
+
+
+def _confidence(name: str, channels: Sequence[Sampled]) -> float:
+    """Chance that a cause shows where it either shows or is absent, with what is expected of other causes' forms."""
+    told, other, absent = _three(name, channels, "lent")
+    return (told + other) / max(told + other + absent, 1e-9)
+
+
+def _three(name: str, channels: Sequence[Sampled], doubt: str) -> tuple[float, float, float]:
+    """(Chance that a cause shows as it is told, the other way round, that it is absent), with ``doubt`` of its size."""
     size, blur, lent, tolerated, believed = (
-        _over_channels(what, name, channels) for what in ("sizes", "blurs", "lent", "tolerated", "believed")
+        _over_channels(what, name, channels) for what in ("sizes", doubt, "lent", "tolerated", "believed")
     )
     beyond = _beyond(size, np.maximum(lent, FORM), tolerated, believed, channels[0].posterior.chance)
     blur = np.maximum(blur, FORM)
-    sides = zip(_chances(size, blur, tolerated), _chances(size, blur, believed), strict=True)
-    told, other = (float(np.mean((1.0 - beyond) * within + beyond * whole)) for within, whole in sides)
+    parts = zip(_chances(size, blur, tolerated), _chances(size, blur, believed), strict=True)
+    told, other, absent = (float(np.mean((1.0 - beyond) * within + beyond * whole)) for within, whole in parts)
     is_error = any(t.effect == name and not t.shape for c in channels for t in c.posterior.channel.nuisances)
-    return told, other if is_error else 0.0
+    return told, other if is_error else 0.0, absent
 
 
 def _beyond(size: Array, lent: Array, tolerated: Array, believed: Array, prior: float) -> Array:
@@ -200,8 +224,8 @@ def _beyond(size: Array, lent: Array, tolerated: Array, believed: Array, prior: 
     return chance
 
 
-def _chances(size: Array, blur: Array, believed: Array) -> tuple[Array, Array]:
-    """(That a cause shows as it is told, that it shows the other way round), one a draw, (draws,) each.
+def _chances(size: Array, blur: Array, believed: Array) -> tuple[Array, Array, Array]:
+    """(That a cause shows as it is told, the other way round, that it is absent), one a draw, (draws,) each.
 
     A draw knows the size as if all forms were right; they blur it, and what was believed of it holds against that.
     """
@@ -210,7 +234,8 @@ def _chances(size: Array, blur: Array, believed: Array) -> tuple[Array, Array]:
     there = size > 0.0
     told: Array = np.where(there, special.ndtr((middle - VISIBLE) / spread), 0.0)
     other: Array = np.where(there, special.ndtr((-middle - VISIBLE) / spread), 0.0)
-    return told, other
+    absent = special.ndtr((ABSENT - middle) / spread) - special.ndtr((-ABSENT - middle) / spread)
+    return told, other, np.where(there, absent, 1.0)
 
 
 def _rivals(row: int, names: Sequence[str], there: np.ndarray, shown: Array) -> tuple[str, ...]:

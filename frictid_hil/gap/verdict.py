@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -85,7 +85,7 @@ def verdict(
         return Verdict("unknown", named, f"{varies.where}: {varies.effect} that comes and goes")
     if unnamed or any(stays(gap, REMAINS) for gap in gaps):
         # What stays may be of another cause.
-        named = tuple(replace(f, chance=min(f.chance, DOUBTED)) for f in named)
+        named = tuple(f.at_most(DOUBTED) for f in named)
     first = named[0]
     rivals = [f for f in named[1:] if f.effect in first.rivals or first.effect in f.rivals]
     if first.leads < LEADS and rivals:

@@ -19,7 +19,7 @@ BACKLASH = {"gap_rad": 0.004, "contact_stiffness_nm_per_rad": 20000.0, "contact_
 
 def cause(effect: str, where: str = "plant", chance: float = 0.99, **values: float) -> Finding:
     told = {name: Value(value, 0.9 * value, 1.1 * value) for name, value in values.items()}
-    return Finding(effect, chance, 5.0, 1.0, told, (), where)
+    return Finding(effect, chance, chance, 5.0, 1.0, told, (), where)
 
 
 def loop(gaps_nm: Mapping[str, float], before_nm: float = 1.0) -> Loop:

@@ -14,11 +14,13 @@ from frictid_hil.gap import noise
 from frictid_hil.gap.channel import FAMILY, Channel, Rows, Term
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.findings import (
+    ABSENT,
     DRAWS,
     VISIBLE,
     Finding,
     _beyond,
     _chances,
+    _confidence,
     _nearest,
     _opposed,
     _ways,
@@ -212,9 +214,30 @@ def test_the_chance_of_a_blurred_error_is_the_share_of_drawn_ones_that_show(beli
     seen = true + blur * rng.normal(size=true.size)
     for size in (0.1, 0.6, 1.2):
         alike = true[np.abs(seen - size) < 0.02]
-        told, other = (np.mean(c) for c in _chances(*(np.full(DRAWS, value) for value in (size, blur, believed))))
+        parts = _chances(*(np.full(DRAWS, value) for value in (size, blur, believed)))
+        told, other, absent = (np.mean(part) for part in parts)
         assert told == pytest.approx(np.mean(alike > VISIBLE), abs=0.02)
         assert other == pytest.approx(np.mean(alike < -VISIBLE), abs=0.02)
+        assert absent == pytest.approx(np.mean(np.abs(alike) < ABSENT), abs=0.02)
+
+
+@pytest.mark.parametrize(("believed", "lent"), [(0.3, 0.2), (1.0, 0.3)])
+def test_a_confidence_is_the_share_of_right_names_among_the_right_and_the_wrong_ones(
+    believed: float, lent: float
+) -> None:
+    """What neither shows nor is absent counts for neither."""
+    rng = np.random.default_rng(6)
+    true = believed * rng.normal(size=2_000_000)
+    seen = true + lent * rng.normal(size=true.size)
+    nuisance = Term("inertia_error", {}, (0,), np.zeros(1), np.ones(1))
+    posterior = SimpleNamespace(chance=0.1, channel=SimpleNamespace(nuisances=(nuisance,)))
+    for size in (0.3, 0.5, 0.8):
+        alike = np.abs(true[np.abs(seen - size) < 0.02])
+        right, wrong = np.mean(alike > VISIBLE), np.mean(alike < ABSENT)
+        figures = {"sizes": size, "blurs": 9.0, "lent": lent, "tolerated": believed, "believed": believed}
+        every = {name: {"inertia_error": np.full(DRAWS, value)} for name, value in figures.items()}
+        channel: Any = SimpleNamespace(posterior=posterior, **every)
+        assert _confidence("inertia_error", [channel]) == pytest.approx(right / (right + wrong), abs=0.03)
 
 
 @pytest.mark.parametrize(("tolerated", "believed", "lent"), [(0.0, 4.0, 0.5), (0.3, 3.0, 0.5), (1.0, 4.0, 0.2)])
@@ -241,7 +264,7 @@ def test_columns_that_move_apart_are_as_many_ways_as_they_are_and_equal_ones_are
 
 def test_what_the_forms_of_others_may_have_made_is_no_error_beyond_its_tolerance() -> None:
     size, blur = np.full(DRAWS, 0.3), np.full(DRAWS, 3.0)
-    narrow, wide = (sum(np.mean(c) for c in _chances(size, blur, np.full(DRAWS, s))) for s in (0.1, 10.0))
+    narrow, wide = (sum(np.mean(c) for c in _chances(size, blur, np.full(DRAWS, s))[:2]) for s in (0.1, 10.0))
     assert narrow < 0.01 < 0.8 < wide
 
 

@@ -198,7 +198,7 @@ def test_a_true_stribeck_effect_is_named_and_carries_the_warning() -> None:
 @pytest.mark.parametrize(("low", "warned"), [(0.15, True), (0.25, False)])
 def test_a_rise_that_lies_above_the_first_pair_was_measured_and_carries_no_warning(low: float, warned: bool) -> None:
     speed = Value(low + 0.05, low, low + 0.1)
-    found = Finding("stribeck", 0.99, 10.0, 1.0, {"stribeck_velocity_rad_s": speed})
+    found = Finding("stribeck", 0.99, 0.99, 10.0, 1.0, {"stribeck_velocity_rad_s": speed})
     curve = FrictionCurve.through(np.array([0.2, 0.8, 1.8]), np.array([3.2, 3.7, 4.5]))
     assert (below_first_pair([found], curve) is not None) is warned
 
