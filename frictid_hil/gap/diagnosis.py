@@ -26,7 +26,7 @@ class Cause:
     """One effect that explains a part of the gap."""
 
     effect: str  # name
-    confidence: float  # calibrated chance that this effect is really there, 0..1
+    confidence: float  # calibrated chance that this effect shows, where it either shows or is absent, 0..1
     # By name with unit; empty for an alternative that was not taken.
     parameters: Mapping[str, Value] = field(default_factory=dict)
     confusable_with: tuple[str, ...] = ()  # effects that this recording can hardly tell from it
