@@ -54,7 +54,7 @@ def verdict(
 ) -> Verdict:
     """Decide."""
     helpless = [g.channel for c, g in zip(channels, gaps, strict=True) if g.after > HELPS * g.before or _faint(c, g)]
-    unreached = [f for f in found if f.size >= FLOORS and needed(f, channels) and _unreached(f, channels)]
+    unreached = [f for f in found if needed(f, channels) and _unreached(f, channels)]
     named = tuple(f for f in found if f.chance >= LISTED and (f.where not in helpless or f in unreached))
     quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
     explained = _root_sum([channel.explained for channel in channels])
