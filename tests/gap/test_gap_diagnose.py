@@ -127,8 +127,9 @@ def drive_that_is_late_at_times(share: float) -> ExperimentSet:
 
 @pytest.mark.slow
 def test_a_small_cause_that_the_validation_logs_never_come_to_is_listed_beside_a_larger_one() -> None:
-    """A drive that clips by one and a half noise floors was left out, for the validation log never came to its limit."""
-    made = gap_sets.make({"torque_bias": {"bias_nm": 0.3}, "torque_saturation": {"limit_share": 0.36, "exponent": 60.0}})
+    """A drive that clips by one and a half floors was left out: the validation log never came to its limit."""
+    clips = {"limit_share": 0.36, "exponent": 60.0}
+    made = gap_sets.make({"torque_bias": {"bias_nm": 0.3}, "torque_saturation": clips})
     logs = (replace(log, validation=log.name == "sines_repeat") for log in made.experiments)
     found = diagnose(replace(made, experiments=tuple(logs)))
     assert [cause.effect for cause in found.causes][:2] == ["torque_bias", "torque_saturation"]
