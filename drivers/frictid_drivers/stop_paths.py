@@ -18,7 +18,7 @@ from frictid_drivers.servos.settings import read_settings as read_servo_settings
 from frictid_hil.errors import FrictidError, GateFailed, HardwareError, Interrupted, SafetyAbort
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol import wishes
-from frictid_hil.runner import process
+from frictid_hil.runner import arm, process
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.stopping import DURATIONS_S
 from frictid_hil.runner.supervisor import JointLimits
@@ -45,7 +45,8 @@ class StopPath:
 
 def _paths() -> list[StopPath]:
     stop = f"at most {DURATIONS_S[-1]:g} s"
-    quick = f"the drive's quick-stop ramp; voltage off after {cia402._SETTLE_S:g} s at the latest"
+    latest_s = arm.STOPPING_S + arm.DISABLING_S + cia402._SETTLE_S
+    quick = f"the drive's quick-stop ramp; voltage off after {latest_s:g} s at the latest"
     cycles, silence = "next cycle", f"{1e3 * Care().silence_s:g} ms, never less than three cycles"
     heartbeat = f"{1e3 * _DRIVE.drive_timeout_s:g} ms"
     watchdog = f"{_DRIVE.watchdog_ms} ms"

@@ -20,8 +20,8 @@ from frictid_hil.units import degrees, format_angle
 
 _POWER_TIMEOUT_S = 15.0
 _STANDSTILL_S = 0.2
-_STOPPING_S = 0.3
-_DISABLING_S = 0.1
+STOPPING_S = 0.3
+DISABLING_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -106,10 +106,10 @@ class Arm:
         loop = self.loop
         self.loop.driver.quick_stop()
         try:
-            loop.settle(_STOPPING_S)
+            loop.settle(STOPPING_S)
             for joint in self.joints:
                 self.loop.driver.disable(joint.name)
-            loop.settle(_DISABLING_S)
+            loop.settle(DISABLING_S)
         except Exception:  # whatever it is, it is not what the person must hear of
             # The wire itself failed: the drives' own watchdogs finish what the quick stop began.
             self.loop.driver.quick_stop()
