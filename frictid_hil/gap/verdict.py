@@ -24,7 +24,8 @@ STANDS_OUT = 1.0
 """Size of all causes together, over the floor, below which nothing is named: less than what noise itself makes."""
 REMAINS = 0.2  # part of a gap that stays, from which on it may hold another cause: 4 % of its power
 DOUBTED = 0.8
-"""Most that is claimed of causes that close the gap although functions without a name would describe it as well."""
+"""Most that is claimed of causes beyond a tolerance that leave a part of the gap, or close one that functions without
+a name would describe as well."""
 HALF = 0.5  # part of a gap from which on it is open although causes were named
 HELPS = 0.98  # gap of the validation logs with the causes over that without, above which they explain nothing there
 READ_DIRECTLY = "kinematics"  # where a cause is read from positions and velocities themselves
@@ -84,8 +85,8 @@ def verdict(
     if (varies := next((f for f in named if f.chance >= EVEN and _varies(f, channels)), None)) is not None:
         return Verdict("unknown", named, f"{varies.where}: {varies.effect} that comes and goes")
     if unnamed or any(stays(gap, REMAINS) for gap in gaps):
-        # What stays may be of another cause.
-        named = tuple(f.at_most(DOUBTED) for f in named)
+        # What stays may be of another cause. An error within its tolerance is to be expected, whatever else is there.
+        named = tuple(f.at_most(DOUBTED) if _beyond_tolerance(f, channels) >= EVEN else f for f in named)
     first = named[0]
     rivals = [f for f in named[1:] if f.effect in first.rivals or first.effect in f.rivals]
     if first.leads < LEADS and rivals:
