@@ -462,6 +462,6 @@ def _not_followed(servos: Sequence[Servo]) -> HardwareError:
     return HardwareError(
         "a stop is not followed; nothing is sent until the bus watchdog has taken the power",
         where=", ".join(f"servo {servo.mine.id}" for servo in servos if servo.may_follow_currents),
-        cause="it hears questions, but no writes",
+        cause="it does not hear what is written, or does not answer",
         next_step="keep away from the joint; switch its supply off",
     )
