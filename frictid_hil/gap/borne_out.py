@@ -68,12 +68,13 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
     if said.word != "unknown" and said.named[0].effect not in refuted:
         return replace(said, named=(*stands, *falls)), _told(kept, refuted, loop, gap_nm)
     stands.sort(key=lambda f: kept.index(f.effect) if f.effect in kept else len(kept))
-    stands = [f.at_most(DOUBTED) for f in stands]
+    stands = [f if f.where == READ_DIRECTLY else f.at_most(DOUBTED) for f in stands]
     if kept:
         stands[0], gap_nm = _refined(stands[0], {name: values[name] for name in kept}, loop, gap_nm)
     told = _told(kept, refuted, loop, gap_nm)
     left = max(0.0, gap_nm**2 - loop.floor_nm**2)
-    if kept and left <= CLOSED**2 * loop.visible:
+    if (kept and left <= CLOSED**2 * loop.visible) or any(f.where == READ_DIRECTLY for f in stands):
+        # What is read from the positions themselves is there, whatever the loop makes of the others.
         return Verdict("explained", (*stands, *falls)), told
     return Verdict("unknown", (*stands, *falls), said.place or NO_NEARER), told
 

@@ -91,6 +91,18 @@ def test_where_nothing_helps_the_gap_is_unknown() -> None:
     assert told is not None and "no cause helps" in told
 
 
+def test_what_is_read_from_positions_stays_when_all_others_fall() -> None:
+    """A coarse encoder that was read was taken back with a friction level that the loop refutes: `unknown`."""
+    named = (cause("friction_level_error", chance=0.6), cause("encoder_quantisation", where=READ_DIRECTLY))
+    gaps = {"friction_level_error": 3.0, "encoder_quantisation": 1.0}
+    said, told = borne_out(Verdict("explained", named), loop(gaps))
+    assert said.word == "explained" and told is not None and "friction_level_error" in told
+    assert [(f.effect, f.confidence) for f in said.named] == [
+        ("encoder_quantisation", 0.99),
+        ("friction_level_error", REFUTED),
+    ]
+
+
 def test_a_cause_that_helps_too_little_leaves_an_unknown() -> None:
     named = (cause("torque_bias"), cause("inertia_error"))
     gaps = {"torque_bias": 9.0, "inertia_error": 0.5, "inertia_error+torque_bias": 9.0}
