@@ -48,12 +48,12 @@ DOCS_PAGE = Path(__file__).parents[1] / "docs" / "evidence" / "gap-sensitivity.m
 BEGIN, END = "<!-- written by benchmarks/gap_sensitivity.py -->", "<!-- end of what it wrote -->"
 FACTORS = (0.5, 2.0)
 LATE: tuple[tuple[ModuleType, str], ...] = (
-    (findings, "VISIBLE"), (findings, "ALIKE"), (findings, "SIDED"), (findings, "UNTOLD"), (verdict, "FLOORS"),
-    (verdict, "AS_STATED"), (verdict, "FLOORS_AS_STATED"), (verdict, "STANDS_OUT"), (borne_out, "CLOSED"),
-    (verdict, "REMAINS"), (verdict, "DOUBTED"), (verdict, "HALF"), (verdict, "LISTED"), (verdict, "NEEDED"),
-    (verdict, "CERTAIN"), (verdict, "EVEN"), (verdict, "LEADS"), (borne_out, "REFUTED"), (how_far, "COLOUR"),
-    (how_far, "APPEARED"), (how_far, "WINDOW_S"), (diagnosis, "NEGLIGIBLE"), (diagnosis, "LOUD"),
-    (diagnosis, "UNDECIDED"),
+    (findings, "VISIBLE"), (findings, "ABSENT"), (findings, "ALIKE"), (findings, "SIDED"), (findings, "UNTOLD"),
+    (verdict, "FLOORS"), (verdict, "AS_STATED"), (verdict, "MOST_EXPECTED"), (verdict, "FLOORS_AS_STATED"),
+    (verdict, "STANDS_OUT"), (borne_out, "CLOSED"), (verdict, "REMAINS"), (verdict, "DOUBTED"), (verdict, "HALF"),
+    (verdict, "LISTED"), (verdict, "NEEDED"), (verdict, "CERTAIN"), (verdict, "EVEN"), (verdict, "LEADS"),
+    (borne_out, "REFUTED"), (how_far, "COLOUR"), (how_far, "APPEARED"), (how_far, "WINDOW_S"),
+    (diagnosis, "NEGLIGIBLE"), (diagnosis, "LOUD"), (diagnosis, "UNDECIDED"),
 )  # fmt: skip
 """What is said of a posterior."""
 SEARCHED: tuple[tuple[ModuleType, str], ...] = (

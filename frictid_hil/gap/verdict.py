@@ -18,14 +18,15 @@ from frictid_hil.simulation.effects import all_effects
 
 FLOORS = 2.0  # a gap below so many noise floors is none, by promise
 AS_STATED = 0.5  # error of a belief over its one-sigma, below which it is as right as it says
+MOST_EXPECTED = 2.0  # the same, above which an error is not to be expected: 95 of 100 beliefs are nearer
 FLOORS_AS_STATED = 3.0
 """A gap below so many floors is none, too, if it means nothing in practice and every belief is as right as it says."""
 STANDS_OUT = 1.0
 """Size of all causes together, over the floor, below which nothing is named: less than what noise itself makes."""
 REMAINS = 0.2  # part of a gap that stays, from which on it may hold another cause: 4 % of its power
-DOUBTED = 0.8
+DOUBTED = 0.89
 """Most that is claimed of causes beyond a tolerance that leave a part of the gap, or close one that functions without
-a name would describe as well."""
+a name would describe as well: less than what counts as sure."""
 HALF = 0.5  # part of a gap from which on it is open although causes were named
 HELPS = 0.98  # gap of the validation logs with the causes over that without, above which they explain nothing there
 READ_DIRECTLY = "kinematics"  # where a cause is read from positions and velocities themselves
@@ -80,13 +81,13 @@ def verdict(
     new = any(gap.appeared is not None and stays(gap, REMAINS) for gap in gaps)
     # Where functions without a name describe it as well, the names tell the gap only if they close it.
     untold = unnamed and any(stays(gap, REMAINS) for gap in gaps)
-    if nothing or untold or new or any(_open(gap, negligible) for gap in gaps):
+    if nothing or generic_wins or untold or new or any(_open(gap, negligible) for gap in gaps):
         return Verdict("unknown", named, place)
     if (varies := next((f for f in named if f.chance >= EVEN and _varies(f, channels)), None)) is not None:
         return Verdict("unknown", named, f"{varies.where}: {varies.effect} that comes and goes")
     if unnamed or any(stays(gap, REMAINS) for gap in gaps):
         # What stays may be of another cause. An error within its tolerance is to be expected, whatever else is there.
-        named = tuple(f.at_most(DOUBTED) if _beyond_tolerance(f, channels) >= EVEN else f for f in named)
+        named = tuple(f if _expected(f, channels) else f.at_most(DOUBTED) for f in named)
     first = named[0]
     rivals = [f for f in named[1:] if f.effect in first.rivals or first.effect in f.rivals]
     if first.leads < LEADS and rivals:
@@ -112,18 +113,31 @@ def _certain(cause: Finding, channels: Sequence[Sampled], gaps: Sequence[Closed]
 
 def as_stated(found: Sequence[Finding], channels: Sequence[Sampled]) -> bool:
     """Whether all causes that are likelier there than not are errors of the belief, well within its tolerances."""
-    plant = [c.posterior.channel for c in channels if c.posterior.channel.name == "plant"]
-    stated = {t.effect: t for channel in plant for t in channel.nuisances if t.effect and not t.shape}
+    stated = _stated(channels)
     likely = [f for f in found if f.chance >= EVEN]
-    return bool(likely) and all(f.effect in stated and _right(f, stated[f.effect]) for f in likely)
+    return bool(likely) and all(f.effect in stated and _within(AS_STATED, f, stated[f.effect]) for f in likely)
 
 
-def _right(error: Finding, belief: Term) -> bool:
-    """Whether an error is small beside the one-sigma of the belief that it is of."""
+def _expected(cause: Finding, channels: Sequence[Sampled]) -> bool:
+    """Whether a cause is likely no more than an error of the belief within its tolerance."""
+    if _beyond_tolerance(cause, channels) >= EVEN:
+        return False
+    stated = _stated(channels)
+    return cause.effect not in stated or _within(MOST_EXPECTED, cause, stated[cause.effect])
+
+
+def _stated(channels: Sequence[Sampled]) -> dict[str, Term]:
+    """Beliefs about the joint, by the cause that an error of each is."""
+    plant = [c.posterior.channel for c in channels if c.posterior.channel.name == "plant"]
+    return {t.effect: t for channel in plant for t in channel.nuisances if t.effect and not t.shape}
+
+
+def _within(one_sigmas: float, error: Finding, belief: Term) -> bool:
+    """Whether an error is less than so many one-sigma of the belief that it is of."""
     form = all_effects()[error.effect].inverse
     assert form is not None
     one_sigma = form.parameters({}, belief.deviation)
-    return all(abs(v.value) < AS_STATED * abs(one_sigma[name]) for name, v in error.parameters.items())
+    return all(abs(v.value) < one_sigmas * abs(one_sigma[name]) for name, v in error.parameters.items())
 
 
 def _unreached(cause: Finding, channels: Sequence[Sampled]) -> bool:

@@ -9,11 +9,13 @@ import gap_sets
 import numpy as np
 import pytest
 
+from frictid_hil.blind.effects import OUTSIDERS
 from frictid_hil.blind.generator import Assignment, draw_case, write_case
 from frictid_hil.config.nominal import Tolerance
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
 from frictid_hil.gap.tolerances import Tolerances
+from frictid_hil.gap.verdict import DOUBTED
 from frictid_hil.simulation.effects.torque_saturation import HARD, reported
 
 
@@ -84,7 +86,8 @@ def test_a_round_knee_approaches_the_clip() -> None:
 
 def _drawn(effects: tuple[str, ...], index: int, seed: int, folder: Path) -> ExperimentSet:
     """A joint of the blind world, whose plant shares no formula with the diagnosis."""
-    write_case(draw_case(index, seed, Assignment("double", effects)), folder)
+    kind = "outside" if set(effects) <= set(OUTSIDERS) else "double"
+    write_case(draw_case(index, seed, Assignment(kind, effects)), folder)
     return ExperimentSet.load(folder)
 
 
@@ -109,3 +112,16 @@ def test_an_error_well_within_its_tolerance_is_no_gap_and_one_beyond_it_is_named
     exact = replace(made.nominal, tolerances=Tolerances.of(Tolerance(friction_torque=0.001)))
     found = diagnose(replace(made, nominal=exact))
     assert found.verdict == "explained" and found.causes[0].effect == "friction_level_error"
+
+
+@pytest.mark.slow
+def test_a_cable_is_unknown_where_most_of_it_has_no_name_although_gravity_would_describe_it(tmp_path: Path) -> None:
+    found = diagnose(_drawn(("cable_spring",), 116, 113207, tmp_path))
+    assert found.verdict == "unknown" and "position" in found.reasons["cause"]
+
+
+@pytest.mark.slow
+def test_an_error_of_three_one_sigma_is_doubted_where_something_has_no_name(tmp_path: Path) -> None:
+    found = diagnose(_drawn(("cable_spring",), 35, 113207, tmp_path))
+    told = {cause.effect: cause.confidence for cause in found.causes}
+    assert told["gravity_error"] == DOUBTED
