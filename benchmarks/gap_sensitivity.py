@@ -1,6 +1,7 @@
 """What half and double of each constant of the diagnosis changes, on drawn joints.
 
     python benchmarks/gap_sensitivity.py [--world wide] [--cases 40] [--seed 1] [--tables 10] [--jobs 2] [--write-docs]
+        [--only verdict.DOUBTED ...]
 
 Every joint is diagnosed as it is, then once for each constant at half and at double its value. What a constant cannot
 change is computed once: recordings, tables of the channels, simulations of the same joint. Constants that enter the
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+import itertools
 import json
 import sys
 import tempfile
@@ -82,9 +84,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--tables", type=int, default=10, help="joints on which constants of the tables are varied")
     parser.add_argument("--jobs", type=int, default=1)
+    known = [_named(*one) for one in (*LATE, *SEARCHED, *TABLES)]
+    parser.add_argument("--only", nargs="+", choices=known, default=known, metavar="CONSTANT", help="vary these alone")
     parser.add_argument("--write-docs", action="store_true")
     arguments = parser.parse_args()
-    rows = measured(arguments.world, arguments.cases, arguments.seed, arguments.tables, arguments.jobs)
+    only = frozenset(arguments.only)
+    if arguments.write_docs and only != frozenset(known):
+        parser.error("--write-docs writes the whole table: leave --only out")
+    rows = measured(arguments.world, arguments.cases, arguments.seed, arguments.tables, arguments.jobs, only)
     told = table(rows)
     print(told)
     if arguments.write_docs:
@@ -100,14 +107,15 @@ Row = list[int]
 """Joints, verdicts changed, first causes changed, right answers; of the same joints as it is: right answers."""
 
 
-def measured(world: str, cases: int, seed: int, tables: int, jobs: int) -> dict[str, Row]:
+def measured(world: str, cases: int, seed: int, tables: int, jobs: int, only: frozenset[str]) -> dict[str, Row]:
     """What was counted, by what was varied."""
     with tempfile.TemporaryDirectory(prefix="frictid-sensitivity-") as folder:
         sealed = draw_sealed(world, cases, seed, Path(folder), jobs, lambda *_: None)
         names = sorted(sealed.truths)
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             whole = [k < tables for k in range(len(names))]
-            answers = list(pool.map(all_answers, [sealed.folder / name for name in names], whole))
+            folders = [sealed.folder / name for name in names]
+            answers = list(pool.map(all_answers, folders, whole, itertools.repeat(only)))
     rows: dict[str, Row] = {}
     for name, answer in zip(names, answers, strict=True):
         plain = answer["as it is"]
@@ -127,13 +135,13 @@ def right(truth: Mapping[str, Any], answer: Answer) -> bool:
     return answer[1] in named
 
 
-def all_answers(case: Path, tables: bool) -> dict[str, Answer]:
-    """The answer as it is, and with every constant at half and at double."""
+def all_answers(case: Path, tables: bool, only: frozenset[str]) -> dict[str, Answer]:
+    """The answer as it is, and with each of the given constants at half and at double."""
     experiments = ExperimentSet.load(case)
     answers: dict[str, Answer] = {}
 
     def vary(constants: Sequence[tuple[ModuleType, str]]) -> None:
-        for what, module, name, factor in _variations(constants):
+        for what, module, name, factor in _variations([one for one in constants if _named(*one) in only]):
             with changed(module, name, factor):
                 answers[what] = _answer(experiments)
 
@@ -202,7 +210,11 @@ def _answer(experiments: ExperimentSet) -> Answer:
 def _variations(constants: Sequence[tuple[ModuleType, str]]) -> Iterator[tuple[str, ModuleType, str, float]]:
     for module, name in constants:
         for factor in FACTORS:
-            yield f"{module.__name__.rpartition('.')[2]}.{name} x {factor:g}", module, name, factor
+            yield f"{_named(module, name)} x {factor:g}", module, name, factor
+
+
+def _named(module: ModuleType, name: str) -> str:
+    return f"{module.__name__.rpartition('.')[2]}.{name}"
 
 
 @contextmanager
