@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
@@ -179,3 +181,18 @@ def test_what_is_in_use_is_counted(benchmark_named: Callable[[str], Any]) -> Non
     soak = benchmark_named("soak")
     before_mb, block = soak.in_use_mb(), bytearray(50_000_000)
     assert soak.in_use_mb() - before_mb == pytest.approx(50.0, abs=1.0) and block
+
+
+def test_calibration_is_pooled_over_checks(benchmark_named: Callable[[str], Any], tmp_path: Path) -> None:
+    for folder, there in (("first", ["stribeck"]), ("second", [])):
+        (tmp_path / folder / "truth").mkdir(parents=True)
+        truth = {"present": there, "main": there, "neutral": ["backlash"], "contributors": []}
+        (tmp_path / folder / "truth" / "case_000.yaml").write_text(yaml.safe_dump(truth))
+        causes = [{"effect": "stribeck", "confidence": 0.75}, {"effect": "backlash", "confidence": 0.9}]
+        answer = {"case": "case_000", "diagnosis": {"verdict": "explained", "causes": causes}}
+        (tmp_path / folder / "answers.json").write_text(json.dumps([answer]))
+    pooled = benchmark_named("gap_pooled")
+    causes = pooled.named_causes(*pooled.pooled([tmp_path / "first", tmp_path / "second"]))
+    assert [(cause.confidence, cause.there) for cause in causes] == [(0.75, True), (0.75, False)]
+    told = pooled.calibration(causes)
+    assert told[0].startswith("calibration error 0.250 over 2 causes") and told[1:] == ["told 0.75: there 1 of 2"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,15 +21,23 @@ BINS = 10  # of confidence, for the calibration error
 LEVEL = "friction_level_error"
 
 
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """A cause that an answer names."""
+
+    confidence: float  # as the answer tells it
+    there: bool  # whether truth has it
+    neutral: bool = False  # neither there nor not: naming it is neither right nor wrong
+
+
 def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Every figure, plain values, from truths and answered lines by case name; a case without a line is an error."""
     absent = {"error": "no answer"}
     cases = [(t, Answer.from_json(documents.get(n, absent)), documents.get(n, absent)) for n, t in truths.items()]
     wrong = [(t, a) for t, a, _ in cases if t["kind"] in ("tolerance", "single", "double")]
     visible = [(t, a) for t, a in wrong if t["size_ratio"] >= VISIBLE]
-    every = [(t, effect, chance) for t, a, _ in cases if a.named for effect, chance in a.causes]
-    # Naming what is neither there nor not is neither right nor wrong.
-    named = [(t, effect, chance) for t, effect, chance in every if _there(t, effect) or effect not in t["neutral"]]
+    every = _causes([(t, a) for t, a, _ in cases])
+    named = [cause for cause in every if not cause.neutral]
     # A first cause that is neither there nor not is no mistake.
     sure = [not _there(t, a.first) and a.first not in t["neutral"] for t, a, _ in cases if a.confidence >= CONFIDENT]
     off = [(t, a) for t, a in visible if LEVEL in t["main"]]
@@ -58,9 +67,9 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
             a.confidence >= 0.5 and a.first not in (*t["main"], *_tied(t)) for t, a in off
         ),
         "parameters": counted(held for t, _, d in cases for held in _held(t, d)),
-        "brier": float(np.mean([(c - _there(t, e)) ** 2 for t, e, c in named])) if named else None,
-        "calibration_error": _calibration_error([(c, _there(t, e)) for t, e, c in named]),
-        "calibration_error_neutral_as_wrong": _calibration_error([(c, _there(t, e)) for t, e, c in every]),
+        "brier": float(np.mean([(cause.confidence - cause.there) ** 2 for cause in named])) if named else None,
+        "calibration_error": calibration_error(named) if named else None,
+        "calibration_error_neutral_as_wrong": calibration_error(every) if every else None,
         "causes": {"judged": len(named), "neutral": len(every) - len(named)},
         "confusion": _confusion([(t, a) for t, a, _ in cases]),
         "seconds": {n: s for n, s in times([a.seconds for _, a, _ in cases]).items() if n != "worst"},
@@ -148,12 +157,26 @@ def _held(truth: Mapping[str, Any], document: Mapping[str, Any]) -> list[bool]:
     ]
 
 
-def _calibration_error(outcomes: Sequence[tuple[float, bool]]) -> float | None:
+def named_causes(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapping[str, Any]]) -> list[Cause]:
+    """What calibration is judged on: all causes of all answers but those that are neither there nor not."""
+    cases = [(t, Answer.from_json(documents[name])) for name, t in truths.items() if name in documents]
+    return [cause for cause in _causes(cases) if not cause.neutral]
+
+
+def _causes(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> list[Cause]:
+    return [
+        Cause(confidence, there, not there and effect in t["neutral"])
+        for t, a in cases
+        if a.named
+        for effect, confidence in a.causes
+        for there in [_there(t, effect)]
+    ]
+
+
+def calibration_error(causes: Sequence[Cause]) -> float:
     """Mean distance of confidence from share, over bins of confidence, weighted by count."""
-    if not outcomes:
-        return None
-    chance = np.array([c for c, _ in outcomes])
-    there = np.array([float(is_there) for _, is_there in outcomes])
+    chance = np.array([cause.confidence for cause in causes])
+    there = np.array([float(cause.there) for cause in causes])
     bins = np.minimum((chance * BINS).astype(int), BINS - 1)
     parts = [abs(float(np.sum(chance[bins == k] - there[bins == k]))) for k in range(BINS)]
     return float(sum(parts) / chance.size)
