@@ -33,13 +33,16 @@ from frictid_hil.gap.residuals import LowPass, Recording, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.tracking_channel import tracking_channel
 from frictid_hil.gap.verdict import (
+    AS_STATED,
     DOUBTED,
     FLOORS,
     FLOORS_AS_STATED,
     HALF,
     READ_DIRECTLY,
+    STANDS_OUT,
     Verdict,
     as_stated,
+    expected,
     needed,
     stays,
     verdict,
@@ -200,12 +203,13 @@ def _quiet_nm(gaps: Sequence[Closed], white_nm: float, negligible_nm: float) -> 
 def _tolerable(
     found: Sequence[Finding], channels: Sequence[Sampled], gaps: Sequence[Closed], negligible_nm: float
 ) -> dict[str, dict[str, float]]:
-    """Errors of the belief within their tolerances that are likelier there than not, where no gap shows besides."""
+    """Causes that are likelier there than not, where no gap shows besides and the belief is as right as it says."""
     floors = FLOORS_AS_STATED if as_stated(found, channels) else FLOORS
     if any(gap.before > min(floors * gap.floor, negligible_nm) for gap in gaps):
         return {}
     likely = [f for f in found if f.chance >= UNDECIDED and f.parameters]
-    if any(needed(f, channels) for f in likely):
+    loud = [f for f in likely if f.size >= STANDS_OUT]
+    if any(needed(f, channels) for f in likely) or not all(expected(f, channels, AS_STATED) for f in loud):
         return {}
     return {f.effect: {name: v.value for name, v in f.parameters.items()} for f in likely}
 

@@ -87,7 +87,7 @@ def verdict(
         return Verdict("unknown", named, f"{varies.where}: {varies.effect} that comes and goes")
     if unnamed or any(stays(gap, REMAINS) for gap in gaps):
         # What stays may be of another cause. An error within its tolerance is to be expected, whatever else is there.
-        named = tuple(f if _expected(f, channels) else f.at_most(DOUBTED) for f in named)
+        named = tuple(f if expected(f, channels) else f.at_most(DOUBTED) for f in named)
     first = named[0]
     rivals = [f for f in named[1:] if f.effect in first.rivals or first.effect in f.rivals]
     if first.leads < LEADS and rivals:
@@ -118,12 +118,12 @@ def as_stated(found: Sequence[Finding], channels: Sequence[Sampled]) -> bool:
     return bool(likely) and all(f.effect in stated and _within(AS_STATED, f, stated[f.effect]) for f in likely)
 
 
-def _expected(cause: Finding, channels: Sequence[Sampled]) -> bool:
-    """Whether a cause is likely no more than an error of the belief within its tolerance."""
+def expected(cause: Finding, channels: Sequence[Sampled], one_sigmas: float = MOST_EXPECTED) -> bool:
+    """Whether a cause is likely no more than an error of the belief within its tolerance, so many one-sigma at most."""
     if _beyond_tolerance(cause, channels) >= EVEN:
         return False
     stated = _stated(channels)
-    return cause.effect not in stated or _within(MOST_EXPECTED, cause, stated[cause.effect])
+    return cause.effect not in stated or _within(one_sigmas, cause, stated[cause.effect])
 
 
 def _stated(channels: Sequence[Sampled]) -> dict[str, Term]:

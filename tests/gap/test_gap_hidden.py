@@ -125,3 +125,13 @@ def test_an_error_of_three_one_sigma_is_doubted_where_something_has_no_name(tmp_
     found = diagnose(_drawn(("cable_spring",), 35, 113207, tmp_path))
     told = {cause.effect: cause.confidence for cause in found.causes}
     assert told["gravity_error"] == DOUBTED
+
+
+@pytest.mark.slow
+def test_an_error_of_the_belief_that_makes_four_floors_in_the_loop_is_named_small_as_it_is_along_the_motion(
+    tmp_path: Path,
+) -> None:
+    """It made 1.6 floors along the motion and less than 5 % of the friction, and was taken for what a belief allows."""
+    write_case(draw_case(67, 113407, Assignment("single", ("torque_constant_error",))), tmp_path)
+    found = diagnose(ExperimentSet.load(tmp_path))
+    assert found.verdict == "explained" and found.causes[0].effect == "torque_constant_error"
