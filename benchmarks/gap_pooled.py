@@ -27,7 +27,11 @@ WORLDS = 2000  # of exactly right chances that are drawn
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="kept by gap check --out")
-    truths, answers = pooled(parser.parse_args().folders)
+    folders = parser.parse_args().folders
+    for folder in folders:
+        if not (folder / "answers.json").is_file():
+            parser.error(f"{folder}: no answers.json here; gap check writes it with the last answer")
+    truths, answers = pooled(folders)
     scores = judged(truths, answers)
     for name, rate in headline(scores).items():
         print(f"{name.replace('_', ' ')}: {rate['right']} of {rate['of']}")
@@ -48,6 +52,8 @@ def pooled(folders: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def calibration(causes: Sequence[Cause]) -> list[str]:
     """Lines: the calibration error, what exactly right chances would show, and one row for each bin."""
+    if not causes:
+        return ["no cause is named"]
     chance = np.array([cause.confidence for cause in causes])
     random = np.random.default_rng(0)
     drawn = [
