@@ -16,7 +16,7 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import can
@@ -33,6 +33,32 @@ pytestmark = pytest.mark.slow
 JOINT = "5"
 NODE = 6
 COUNTS_PER_RAD = 131072 * 81.5 / (2 * math.pi)
+TRIES = 4
+STALLED = ("the computer was late", "no heartbeat for")  # what a run says that a stall of 0.1 s or more has ended
+
+
+class Terminal:
+    """A terminal that somebody watches until it is closed."""
+
+    def __init__(self) -> None:
+        self._ours, self.program_side = pty.openpty()
+        self._shown = bytearray()
+        self._closing = threading.Event()
+        self._watch = threading.Thread(target=self._look)
+        self._watch.start()
+
+    def close(self) -> str:
+        """What it has shown until now."""
+        self._closing.set()
+        self._watch.join()
+        return self._shown.decode(errors="replace")
+
+    def _look(self) -> None:
+        with contextlib.suppress(OSError):  # nobody writes to it any more
+            while not self._closing.is_set():
+                if select.select([self._ours], [], [], 0.05)[0]:
+                    self._shown += os.read(self._ours, 4096)
+        os.close(self._ours)
 
 
 class Running:
@@ -41,11 +67,13 @@ class Running:
     Args:
         out: folder of the run.
         channel: of the bus.
-        terminal: that it runs on, as the side of the program; None for a pipe.
+        terminal: that it runs on; None for a pipe.
     """
 
-    def __init__(self, out: Path, channel: str, terminal: int | None = None) -> None:
+    def __init__(self, out: Path, channel: str, terminal: Terminal | None = None) -> None:
         self.out = out
+        self.terminal = terminal
+        shown_on = None if terminal is None else terminal.program_side
         program = Path(sys.executable).parent / "frictid-hil"
         self.parent = subprocess.Popen(
             [
@@ -53,30 +81,31 @@ class Running:
                 *("calibrate", "--robot", "hp3j", "--joint", JOINT, "--cycles", "3", "--realtime", "--yes"),
                 *("--bus", f"virtual:{channel}", "--out", str(out)),
             ],
-            stdin=terminal,
-            stdout=subprocess.PIPE if terminal is None else terminal,
+            stdin=shown_on,
+            stdout=subprocess.PIPE if shown_on is None else shown_on,
             stderr=subprocess.STDOUT,
             text=True,
             start_new_session=terminal is not None,
             preexec_fn=None if terminal is None else lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
         )
+        if shown_on is not None:
+            os.close(shown_on)
         self.bus = self._listen(channel)
 
-    def wait_for_cycles(self) -> None:
-        """Until the joint moves faster than the slow moves around the cycles do."""
+    def reaches_its_cycles(self) -> bool:
+        """Wait until it moves faster than the slow moves around the cycles do; False where it ends first."""
         until = time.monotonic() + 60
         before: tuple[float, float] | None = None
-        while time.monotonic() < until:
-            try:
+        with contextlib.suppress(can.CanError):  # the simulated bus ends with its owner
+            while time.monotonic() < until:
                 at = self.position_rad()
-            except can.CanError:
-                raise AssertionError(f"the run ended early: {self.parent.communicate()[0]}") from None
-            if before is not None and at is not None and at[0] - before[0] > 0.02:
-                if abs(at[1] - before[1]) / (at[0] - before[0]) > math.radians(40):
-                    return
-                before = at
-            before = before or at
-        raise AssertionError("the cycles never began")
+                if before is not None and at is not None and at[0] - before[0] > 0.02:
+                    if abs(at[1] - before[1]) / (at[0] - before[0]) > math.radians(40):
+                        return True
+                    before = at
+                before = before or at
+            raise AssertionError("the cycles never began")
+        return False
 
     def position_rad(self) -> tuple[float, float] | None:
         """(time, position) of the next report of the joint."""
@@ -100,7 +129,16 @@ class Running:
     def last_words(self) -> str:
         """What the command printed until its end. Drives without a host live on while somebody listens to them."""
         self.bus.shutdown()
-        return self.parent.communicate(timeout=60)[0]
+        said = self.parent.communicate(timeout=60)[0]
+        return said if self.terminal is None else self.terminal.close()
+
+    def end(self) -> None:
+        """Whatever became of it."""
+        self.parent.kill()
+        self.parent.wait()
+        self.bus.shutdown()
+        if self.terminal is not None:
+            self.terminal.close()
 
     @staticmethod
     def _listen(channel: str) -> can.BusABC:
@@ -111,16 +149,26 @@ class Running:
         raise AssertionError("the simulated bus never came up")
 
 
+@contextlib.contextmanager
+def in_its_cycles(folder: Path, terminal: Callable[[], Terminal | None] = lambda: None) -> Iterator[Running]:
+    """A run in its cycles; a new one where this computer stalled before they began, and the drives rightly ended it."""
+    for number in range(TRIES):
+        run = Running(folder / f"run-{number}", f"kill-{os.getpid()}-{folder.name}-{number}", terminal())
+        try:
+            if run.reaches_its_cycles():
+                yield run
+                return
+            said = run.last_words()
+            assert run.parent.returncode == 4 and any(words in said for words in STALLED), f"ended early: {said}"
+        finally:
+            run.end()
+    raise AssertionError(f"stalled {TRIES} times: {said}")
+
+
 @pytest.fixture
 def running(tmp_path: Path) -> Iterator[Running]:
-    run = Running(tmp_path / "run", f"kill-{os.getpid()}-{tmp_path.name}")
-    try:
-        run.wait_for_cycles()
+    with in_its_cycles(tmp_path) as run:
         yield run
-    finally:
-        run.parent.kill()
-        run.parent.wait()
-        run.bus.shutdown()
 
 
 def positions_until_quiet(run: Running, seconds: float) -> list[float]:
@@ -208,31 +256,14 @@ def test_a_hang_up_stops_the_run_like_ctrl_c_and_leaves_no_shared_memory(running
 
 
 def test_a_closed_terminal_stops_the_run_like_ctrl_c(tmp_path: Path) -> None:
-    ours, theirs = pty.openpty()
-    run = Running(tmp_path / "run", f"closed-{os.getpid()}", terminal=theirs)
-    os.close(theirs)
-    closed = threading.Event()
-    threading.Thread(target=_shown, args=(ours, closed)).start()
-    try:
-        run.wait_for_cycles()
-        closed.set()
+    with in_its_cycles(tmp_path, Terminal) as run:
+        assert run.terminal is not None
+        run.terminal.close()
         positions_until_quiet(run, 0.5)
         run.bus.shutdown()
         assert run.parent.wait(60) == 130
         assert json.loads((run.out / "manifest.json").read_text())["outcome"] == "interrupted"
         assert run.last_run_time_s() > 3.0
-    finally:
-        closed.set()
-        run.parent.kill()
-        run.parent.wait()
-
-
-def _shown(terminal: int, closed: threading.Event) -> None:
-    """Take what a program shows; then close its terminal."""
-    while not closed.is_set():
-        if select.select([terminal], [], [], 0.05)[0]:
-            os.read(terminal, 4096)
-    os.close(terminal)
 
 
 def speed_at_the_quick_stop_rad_s(run: Running) -> float:
