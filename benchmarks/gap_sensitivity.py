@@ -52,7 +52,7 @@ FACTORS = (0.5, 2.0)
 LATE: tuple[tuple[ModuleType, str], ...] = (
     (findings, "VISIBLE"), (findings, "ABSENT"), (findings, "ALIKE"), (findings, "SIDED"), (findings, "UNTOLD"),
     (verdict, "FLOORS"), (verdict, "AS_STATED"), (verdict, "MOST_EXPECTED"), (verdict, "FLOORS_AS_STATED"),
-    (verdict, "STANDS_OUT"), (borne_out, "CLOSED"), (verdict, "REMAINS"), (verdict, "DOUBTED"), (verdict, "HALF"),
+    (verdict, "STANDS_OUT"), (verdict, "REMAINS"), (verdict, "DOUBTED"), (verdict, "HALF"),
     (verdict, "LISTED"), (verdict, "NEEDED"), (verdict, "CERTAIN"), (verdict, "EVEN"), (verdict, "LEADS"),
     (borne_out, "REFUTED"), (how_far, "COLOUR"), (how_far, "APPEARED"), (how_far, "WINDOW_S"),
     (diagnosis, "NEGLIGIBLE"), (diagnosis, "LOUD"), (diagnosis, "UNDECIDED"),

@@ -34,6 +34,8 @@ FORM = {"none": 0.45, "tolerance": 0.7, "single": 1.0, "double": 1.0, "outside":
 FORMS = ("presliding_hysteresis", "viscous_nonlinearity", "stribeck", "stiction_breakaway")
 """What that may rightly be called."""
 PAIRS = 14
+FINE = 1e-3  # encoder step that sizes are measured with, over the joint's own: its noise belongs to the floor
+BEGUN_S = 0.3  # from then on a motion is compared: what a low-pass makes of its start is over
 TIE = 0.35  # a single cause that leaves less of another one than this, in floors, can't be told from it
 DRIVE = ("torque_delay", "electrical_lag", "torque_saturation")  # nobody sees them without the controller
 _LEFT_OUT = ("velocity_lag", "encoder_quantisation", "temperature_drift", "backlash", "joint_elasticity")
@@ -129,7 +131,7 @@ def draw_wide(index: int, seed: int, kind: str) -> Drawn:
         if base is None:
             continue
         floor = _floor(setting)
-        form = _form(setting, base, floor)
+        form = rms(np.concatenate(_along(setting, base))) / floor  # what is left though every number is right
         if form > FORM[kind]:
             continue
         drawn = _contributors(rng, setting, kind, max(float(np.abs(t).max()) for _, t, _ in base))
@@ -437,10 +439,11 @@ Run = tuple[Array, Array, Array]
 
 
 def _runs(setting: Setting, physics: Physics, control: Controller) -> list[Run] | None:
-    """Every motion without noise; None where the controller cannot hold the joint."""
+    """Every motion without noise and without an encoder's steps; None where the controller cannot hold the joint."""
     runs, heat, clock = [], 0.0, 0.0
+    exact = physics._replace(encoder_step=FINE * physics.encoder_step)
     for motion in setting.motions:
-        mounted = setting.payload.on(physics, motion.payload)
+        mounted = setting.payload.on(exact, motion.payload)
         never = np.ones(motion.command.size)
         chance = np.random.default_rng(motion.command.size).random(motion.command.size) if physics.missed else never
         position, _, torque, heat = plant.run(motion.command, control, mounted, heat, clock, chance)
@@ -483,14 +486,14 @@ def _pairs(setting: Setting) -> tuple[list[float], list[float]]:
     return speeds, [p.coulomb + float(plant.rate_part(_bare(p), speed)) for speed in speeds]
 
 
-def _form(setting: Setting, base: Sequence[Run], floor_nm: float) -> float:
-    """Size of what the believed joint leaves though every number is right: torque less its file's own equation."""
+def _along(setting: Setting, runs: Sequence[Run]) -> list[Array]:
+    """Torque less what the joint's file asks for along each motion, low-passed: what its own equation leaves."""
     p, tick = setting.physics, setting.control.tick
     speeds, torques = _pairs(setting)
     # The curve goes on below its first pair along its first line.
     level = max(1e-12, torques[0] - (torques[1] - torques[0]) / (speeds[1] - speeds[0]) * speeds[0])
     left = []
-    for (q, torque, _), motion in zip(base, setting.motions, strict=True):
+    for (q, torque, _), motion in zip(runs, setting.motions, strict=True):
         mounted = setting.payload.on(p, motion.payload)
         v = np.gradient(q, tick)
         bend = np.zeros_like(q)
@@ -499,9 +502,8 @@ def _form(setting: Setting, base: Sequence[Run], floor_nm: float) -> float:
         friction = level * slip_of_spring(q, p.slip_length * level / p.coulomb) + np.sign(v) * sliding
         rigid = (mounted.motor_inertia + mounted.link_inertia) * bend + mounted.gravity * np.cos(q)
         centred = 0.5 * (torque + np.concatenate([torque[1:], torque[-1:]]))
-        left.append(low_pass(centred - rigid - friction, 1.0 / tick)[round(0.3 / tick) :])
-    # The encoder's steps shake the acceleration; that part of the floor is there already.
-    return math.sqrt(max(0.0, rms(np.concatenate(left)) ** 2 - _shaken_nm(setting) ** 2)) / floor_nm
+        left.append(low_pass(centred - rigid - friction, 1.0 / tick)[round(BEGUN_S / tick) :])
+    return left
 
 
 def _shaken_nm(setting: Setting) -> float:
@@ -530,12 +532,17 @@ def _applied(setting: Setting, reasons: Sequence[Contributor]) -> Changed:
 
 
 def _response(setting: Setting, base: Sequence[Run], reasons: Sequence[Contributor]) -> dict[str, list[Array]] | None:
-    """What reasons change, by channel and motion, low-passed: the torque, and torque less demand."""
+    """What reasons change, by channel and motion, low-passed.
+
+    Channels are the torque of the closed loop, torque less what the file asks for along the motion (``inverse``), and
+    torque less demand (``actuation``).
+    """
     runs = _runs(setting, *_applied(setting, reasons))
     if runs is None:
         return None
     rate = 1.0 / setting.control.tick
     changed = {"torque": [low_pass(t - t0, rate) for (_, t, _), (_, t0, _) in zip(runs, base, strict=True)]}
+    changed["inverse"] = [left - own for left, own in zip(_along(setting, runs), _along(setting, base), strict=True)]
     if setting.controller != "unknown":
         late = [(t[1:] - a[:-1]) - (t0[1:] - a0[:-1]) for (_, t, a), (_, t0, a0) in zip(runs, base, strict=True)]
         changed["actuation"] = [low_pass(part - np.median(part[: round(0.5 * rate)]), rate) for part in late]
@@ -713,11 +720,11 @@ def _truth(
 
 
 def _tied(setting: Setting, base: Sequence[Run], reason: Contributor, floor_nm: float) -> list[str]:
-    """Single causes that leave next to nothing of what a reason changes in the torque on these motions."""
+    """Single causes that leave next to nothing of what a reason changes along these motions."""
     changed = _response(setting, base, [reason])
-    if changed is None or rms(np.concatenate(changed["torque"])) < PRESENT * floor_nm:
+    if changed is None or rms(np.concatenate(changed["inverse"])) < PRESENT * floor_nm:
         return []
-    target = np.concatenate(changed["torque"])
+    target = np.concatenate(changed["inverse"])
     p, tick = setting.physics, setting.control.tick
     columns: dict[str, list[Array]] = {}
     bare = _bare(p)
@@ -734,7 +741,7 @@ def _tied(setting: Setting, base: Sequence[Run], reason: Contributor, floor_nm: 
             "viscous_error": rate, "torque_constant_error": torque, "direction_asymmetry": np.abs(s),
             "torque_delay": np.gradient(torque, tick),
         }.items():  # fmt: skip
-            columns.setdefault(name, []).append(low_pass(column, 1.0 / tick))
+            columns.setdefault(name, []).append(low_pass(column, 1.0 / tick)[round(BEGUN_S / tick) :])
     tied = []
     for name, parts in columns.items():
         column = np.concatenate(parts)

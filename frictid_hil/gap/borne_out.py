@@ -17,7 +17,6 @@ from frictid_hil.simulation.effects import all_effects
 
 FACTORS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 """Factors of a parameter that are tried where a motion alone could not tell it."""
-CLOSED = 0.33  # part of the closed loop's gap that may stay where causes explain it: 11 % of its power
 REFUTED = 0.4  # most that is claimed of a cause that the closed loop does not bear out
 LITTLE = "closed loop: most of its gap stays"
 NO_NEARER = "closed loop: what describes the torque along the motion brings the simulated joint no nearer"
@@ -73,7 +72,7 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
         stands[0], gap_nm = _refined(stands[0], {name: values[name] for name in kept}, loop, gap_nm)
     told = _told(kept, refuted, loop, gap_nm)
     left = max(0.0, gap_nm**2 - loop.floor_nm**2)
-    if (kept and left <= CLOSED**2 * loop.visible) or any(f.where == READ_DIRECTLY for f in stands):
+    if (kept and left <= REMAINS**2 * loop.visible) or any(f.where == READ_DIRECTLY for f in stands):
         # What is read from the positions themselves is there, whatever the loop makes of the others.
         return Verdict("explained", (*stands, *falls)), told
     return Verdict("unknown", (*stands, *falls), said.place or NO_NEARER), told
@@ -95,7 +94,7 @@ def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm
 def _rescued(said: Verdict, values: Effects, loop: Loop, gap_nm: float) -> tuple[Verdict, str | None]:
     """A first cause that lets the link swing may close the loop, although its columns lose the link's phase."""
     first, closer_nm = _refined(said.named[0], {said.named[0].effect: values[said.named[0].effect]}, loop, gap_nm)
-    if first is said.named[0] or closer_nm**2 - loop.floor_nm**2 > CLOSED**2 * loop.visible:
+    if first is said.named[0] or closer_nm**2 - loop.floor_nm**2 > REMAINS**2 * loop.visible:
         return said, None
     rest = [f for f in said.named if f.effect != first.effect]
     return _doubted(Verdict("explained", (first, *rest))), _told([first.effect], set(), loop, closer_nm)

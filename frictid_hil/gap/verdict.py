@@ -55,9 +55,11 @@ def verdict(
     otherwise_quiet: bool,  # the residual before any filter and the simulated closed loop show no more than noise
 ) -> Verdict:
     """Decide."""
-    helpless = [g.channel for c, g in zip(channels, gaps, strict=True) if g.after > HELPS * g.before or _faint(c, g)]
+    helpless = [gap.channel for gap in gaps if gap.after > HELPS * gap.before]
+    faint = [gap.channel for c, gap in zip(channels, gaps, strict=True) if _faint(c, gap)]
     unreached = [f for f in found if needed(f, channels) and _unreached(f, channels)]
-    named = tuple(f for f in found if f.chance >= LISTED and (f.where not in helpless or f in unreached))
+    shown = [f for f in found if f.where not in helpless and (f.where not in faint or f.size > FLOORS)]
+    named = tuple(f for f in found if f.chance >= LISTED and (f in shown or f in unreached))
     quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
     explained = _root_sum([channel.explained for channel in channels])
     generic = _root_sum([channel.generic for channel in channels])
