@@ -59,6 +59,8 @@ class Sampled:
     draws: Sequence[Draw]  # samples
     # By cause, its size over the floor in every draw less what others take back, (draws,); 0 if not in.
     sizes: Mapping[str, Array]
+    # By cause, the sign of its coefficient, (draws,); 1 where it has several columns and so no sides.
+    signs: Mapping[str, Array]
     # By cause, one-sigma of what the forms of the others may have put on it, in the same unit.
     blurs: Mapping[str, Array]
     lent: Mapping[str, Array]  # the part of it that is expected, where those forms may be off in any way
@@ -75,7 +77,8 @@ def sampled(posterior: Posterior) -> Sampled:
     x = np.concatenate([log.x[log.told] - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
     draws = [plainest(posterior, draw, gram) for draw in posterior.draws(posterior.search(), DRAWS)]
-    sizes, blurs, believed, tolerated = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(4))
+    made = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(5))
+    sizes, signs, blurs, believed, tolerated = made
     expected = 1.0 / math.sqrt(_ways(posterior, gram))
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
 
@@ -93,6 +96,7 @@ def sampled(posterior: Posterior) -> Sampled:
         unnamed = [parts[""]] if "" in parts else []
         for effect, net, blur in zip(causes, *_net([*causes.values(), *unnamed], gram), strict=False):
             sizes[effect][k] = net / posterior.floor
+            signs[effect][k] = _sign(*causes[effect])
             blurs[effect][k] = blur / posterior.floor
         for effect, (within, whole) in posterior.believed(draw, np.diag(gram)).items():
             tolerated[effect][k] = math.sqrt(within) / posterior.floor
@@ -100,7 +104,11 @@ def sampled(posterior: Posterior) -> Sampled:
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
     lent = {effect: expected * blur for effect, blur in blurs.items()}
-    return Sampled(posterior, draws, sizes, blurs, lent, believed, tolerated, generic, explained, gram)
+    return Sampled(posterior, draws, sizes, signs, blurs, lent, believed, tolerated, generic, explained, gram)
+
+
+def _sign(columns: np.ndarray, values: Array) -> float:
+    return float(np.sign(np.sum(values))) if np.all(columns == columns[0]) else 1.0
 
 
 def _ways(posterior: Posterior, gram: Array) -> float:
@@ -186,31 +194,37 @@ def _over_channels(what: str, name: str, channels: Sequence[Sampled]) -> Array:
 
 
 def _sides(name: str, channels: Sequence[Sampled]) -> tuple[float, float]:
-    """(Chance that a cause shows as it is told, that it shows the other way round, which only an error can).
+    """(Chance that a cause shows on its likelier side, that it shows on the other one, which only an error has).
 
     The most that other causes' forms may have put on it counts as its doubt: this decides what is said at all.
     """
     told, other, _ = _three(name, channels, "blurs")
-    return told, other
+    home = max(channels, key=lambda c: rms(c.sizes.get(name, np.zeros(1))))
+    above = home.signs[name] >= 0.0
+    sides = float(np.mean(np.where(above, told, other))), float(np.mean(np.where(above, other, told)))
+    return max(sides), min(sides)
 
 
 def _confidence(name: str, channels: Sequence[Sampled]) -> float:
     """Chance that a cause shows where it either shows or is absent, with what is expected of other causes' forms."""
-    told, other, absent = _three(name, channels, "lent")
+    told, other, absent = (float(np.mean(part)) for part in _three(name, channels, "lent"))
     return (told + other) / max(told + other + absent, 1e-9)
 
 
-def _three(name: str, channels: Sequence[Sampled], doubt: str) -> tuple[float, float, float]:
-    """(Chance that a cause shows as it is told, the other way round, that it is absent), with ``doubt`` of its size."""
+def _three(name: str, channels: Sequence[Sampled], doubt: str) -> tuple[Array, Array, Array]:
+    """(Chance that a cause shows as a draw has it, the other way round, that it is absent), one a draw, (draws,) each.
+
+    ``doubt`` is what its size may be off by. Only an error of the belief can show the other way round.
+    """
     size, blur, lent, tolerated, believed = (
         _over_channels(what, name, channels) for what in ("sizes", doubt, "lent", "tolerated", "believed")
     )
     beyond = _beyond(size, np.maximum(lent, FORM), tolerated, believed, channels[0].posterior.chance)
     blur = np.maximum(blur, FORM)
     parts = zip(_chances(size, blur, tolerated), _chances(size, blur, believed), strict=True)
-    told, other, absent = (float(np.mean((1.0 - beyond) * within + beyond * whole)) for within, whole in parts)
+    told, other, absent = ((1.0 - beyond) * within + beyond * whole for within, whole in parts)
     is_error = any(t.effect == name and not t.shape for c in channels for t in c.posterior.channel.nuisances)
-    return told, other if is_error else 0.0, absent
+    return told, is_error * other, absent
 
 
 def _beyond(size: Array, lent: Array, tolerated: Array, believed: Array, prior: float) -> Array:
@@ -225,7 +239,7 @@ def _beyond(size: Array, lent: Array, tolerated: Array, believed: Array, prior: 
 
 
 def _chances(size: Array, blur: Array, believed: Array) -> tuple[Array, Array, Array]:
-    """(That a cause shows as it is told, the other way round, that it is absent), one a draw, (draws,) each.
+    """(That a cause shows as the draw has it, the other way round, that it is absent), one a draw, (draws,) each.
 
     A draw knows the size as if all forms were right; they blur it, and what was believed of it holds against that.
     """
