@@ -9,7 +9,7 @@ integrator are those of ``plant``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -34,7 +34,7 @@ FORM = {"none": 0.45, "tolerance": 0.7, "single": 1.0, "double": 1.0, "outside":
 FORMS = ("presliding_hysteresis", "viscous_nonlinearity", "stribeck", "stiction_breakaway")
 """What that may rightly be called."""
 PAIRS = 14
-FINE = 1e-3  # encoder step that sizes are measured with, over the joint's own: its noise belongs to the floor
+FINE = 1e-3  # encoder step that sizes are measured with, over the joint's own: what steps make belongs to the floor
 BEGUN_S = 0.3  # from then on a motion is compared: what a low-pass makes of its start is over
 TIE = 0.35  # a single cause that leaves less of another one than this, in floors, can't be told from it
 DRIVE = ("torque_delay", "electrical_lag", "torque_saturation")  # nobody sees them without the controller
@@ -130,23 +130,25 @@ def draw_wide(index: int, seed: int, kind: str) -> Drawn:
         base = _runs(setting, setting.physics, setting.control)
         if base is None:
             continue
-        floor = _floor(setting)
-        form = rms(np.concatenate(_along(setting, base))) / floor  # what is left though every number is right
+        floors = _floors(setting, base)
+        if floors is None:
+            continue
+        form = rms(np.concatenate(_along(setting, base))) / floors["inverse"]  # left though every number is right
         if form > FORM[kind]:
             continue
         drawn = _contributors(rng, setting, kind, max(float(np.abs(t).max()) for _, t, _ in base))
-        sizes = [_size(setting, base, [one], floor) for one in drawn]
+        sizes = [_size(setting, base, [one], floors) for one in drawn]
         reasons = [replace(one, sizes=size) for one, size in zip(drawn, sizes, strict=True) if size is not None]
         if len(reasons) < len(drawn):
             continue
         if kind == "none":
-            reasons = _shrunk(setting, base, reasons, floor)
-        total = _size(setting, base, reasons, floor)
+            reasons = _shrunk(setting, base, reasons, floors)
+        total = _size(setting, base, reasons, floors)
         if total is None or not _as_wanted(kind, reasons, max(total.values())):
             continue
         logs = _recorded(rng, setting, *_applied(setting, reasons))
         name = f"case_{index:03d}"
-        return _nominal(name, setting), logs, _truth(name, kind, setting, base, reasons, total, floor, form)
+        return _nominal(name, setting), logs, _truth(name, kind, setting, base, reasons, total, floors, form)
     raise RuntimeError(f"no joint came up for case {index} of kind {kind}")
 
 
@@ -438,12 +440,12 @@ Run = tuple[Array, Array, Array]
 """Position, torque and what the believed controller would have asked for along it; at the control ticks."""
 
 
-def _runs(setting: Setting, physics: Physics, control: Controller) -> list[Run] | None:
-    """Every motion without noise and without an encoder's steps; None where the controller cannot hold the joint."""
+def _runs(setting: Setting, physics: Physics, control: Controller, steps: float = FINE) -> list[Run] | None:
+    """Every motion without noise, an encoder's steps so much finer; None where the controller cannot hold the joint."""
     runs, heat, clock = [], 0.0, 0.0
-    exact = physics._replace(encoder_step=FINE * physics.encoder_step)
+    physics = physics._replace(encoder_step=steps * physics.encoder_step)
     for motion in setting.motions:
-        mounted = setting.payload.on(exact, motion.payload)
+        mounted = setting.payload.on(physics, motion.payload)
         never = np.ones(motion.command.size)
         chance = np.random.default_rng(motion.command.size).random(motion.command.size) if physics.missed else never
         position, _, torque, heat = plant.run(motion.command, control, mounted, heat, clock, chance)
@@ -470,12 +472,26 @@ def asked(c: Controller, command: Array, position: Array, start_nm: float) -> Ar
     return demand
 
 
-def _floor(setting: Setting) -> float:
-    """What torque noise and the encoder's steps leave behind the low-pass, N m."""
-    rng = np.random.default_rng(1)
-    rate = 1.0 / setting.step_s
-    torque = low_pass(_noise(rng, setting, 20_000), rate)
-    return math.hypot(rms(torque), _shaken_nm(setting))
+def _floors(setting: Setting, base: Sequence[Run]) -> dict[str, float] | None:
+    """What torque noise and the encoder's steps leave of each channel behind the low-pass, N m; None as above.
+
+    A closed loop that nobody can simulate is no channel.
+    """
+    rate, step = 1.0 / setting.step_s, setting.physics.encoder_step
+    noise = rms(low_pass(_noise(np.random.default_rng(1), setting, 20_000), rate))
+    read = [(q[:: setting.thin], motion) for (q, _, _), motion in zip(base, setting.motions, strict=True)]
+    shaken = [
+        _asked_nm(setting, np.round(q / step) * step, m, setting.step_s) - _asked_nm(setting, q, m, setting.step_s)
+        for q, m in read
+    ]
+    floors = {"inverse": math.hypot(noise, rms(np.concatenate([low_pass(part, rate) for part in shaken])))}
+    if setting.controller == "unknown":
+        return floors
+    stepped = _runs(setting, setting.physics, setting.control, steps=1.0)
+    if stepped is None:
+        return None
+    apart = [low_pass(t - t0, 1.0 / setting.control.tick) for (_, t, _), (_, t0, _) in zip(stepped, base, strict=True)]
+    return {**floors, "torque": math.hypot(noise, rms(np.concatenate(apart))), "actuation": noise}
 
 
 def _pairs(setting: Setting) -> tuple[list[float], list[float]]:
@@ -488,30 +504,27 @@ def _pairs(setting: Setting) -> tuple[list[float], list[float]]:
 
 def _along(setting: Setting, runs: Sequence[Run]) -> list[Array]:
     """Torque less what the joint's file asks for along each motion, low-passed: what its own equation leaves."""
-    p, tick = setting.physics, setting.control.tick
-    speeds, torques = _pairs(setting)
-    # The curve goes on below its first pair along its first line.
-    level = max(1e-12, torques[0] - (torques[1] - torques[0]) / (speeds[1] - speeds[0]) * speeds[0])
-    left = []
+    tick, left = setting.control.tick, []
     for (q, torque, _), motion in zip(runs, setting.motions, strict=True):
-        mounted = setting.payload.on(p, motion.payload)
-        v = np.gradient(q, tick)
-        bend = np.zeros_like(q)
-        bend[1:-1] = np.diff(q, 2) / tick**2
-        sliding = np.interp(np.abs(v), [0.0, *speeds], [level, *torques]) - level
-        friction = level * slip_of_spring(q, p.slip_length * level / p.coulomb) + np.sign(v) * sliding
-        rigid = (mounted.motor_inertia + mounted.link_inertia) * bend + mounted.gravity * np.cos(q)
         centred = 0.5 * (torque + np.concatenate([torque[1:], torque[-1:]]))
-        left.append(low_pass(centred - rigid - friction, 1.0 / tick)[round(BEGUN_S / tick) :])
+        left.append(low_pass(centred - _asked_nm(setting, q, motion, tick), 1.0 / tick)[round(BEGUN_S / tick) :])
     return left
 
 
-def _shaken_nm(setting: Setting) -> float:
-    """What the encoder's steps leave of the inertia's torque behind the low-pass, N m."""
-    rng, step_s = np.random.default_rng(2), setting.step_s
-    steps = setting.physics.encoder_step * (rng.random(20_000) - 0.5)
-    inertia = setting.physics.motor_inertia + setting.physics.link_inertia
-    return rms(low_pass(inertia * np.gradient(np.gradient(steps, step_s), step_s), 1.0 / step_s))
+def _asked_nm(setting: Setting, q: Array, motion: Motion, step_s: float) -> Array:
+    """Torque that the joint's file asks for along a motion, N m, shape (n,)."""
+    p = setting.physics
+    speeds, torques = _pairs(setting)
+    # The curve goes on below its first pair along its first line.
+    level = max(1e-12, torques[0] - (torques[1] - torques[0]) / (speeds[1] - speeds[0]) * speeds[0])
+    mounted = setting.payload.on(p, motion.payload)
+    v = np.gradient(q, step_s)
+    bend = np.zeros_like(q)
+    bend[1:-1] = np.diff(q, 2) / step_s**2
+    sliding = np.interp(np.abs(v), [0.0, *speeds], [level, *torques]) - level
+    friction = level * slip_of_spring(q, p.slip_length * level / p.coulomb) + np.sign(v) * sliding
+    asked: Array = (mounted.motor_inertia + mounted.link_inertia) * bend + mounted.gravity * np.cos(q) + friction
+    return asked
 
 
 def _noise(rng: np.random.Generator, setting: Setting, rows: int) -> Array:
@@ -550,21 +563,21 @@ def _response(setting: Setting, base: Sequence[Run], reasons: Sequence[Contribut
 
 
 def _size(
-    setting: Setting, base: Sequence[Run], reasons: Sequence[Contributor], floor_nm: float
+    setting: Setting, base: Sequence[Run], reasons: Sequence[Contributor], floors: Mapping[str, float]
 ) -> dict[str, float] | None:
     changed = _response(setting, base, reasons)
     if changed is None:
         return None
-    return {channel: rms(np.concatenate(parts)) / floor_nm for channel, parts in changed.items()}
+    return {channel: rms(np.concatenate(changed[channel])) / floor_nm for channel, floor_nm in floors.items()}
 
 
 def _shrunk(
-    setting: Setting, base: Sequence[Run], reasons: Sequence[Contributor], floor_nm: float
+    setting: Setting, base: Sequence[Run], reasons: Sequence[Contributor], floors: Mapping[str, float]
 ) -> list[Contributor]:
     """Deviations taken away, the largest first, until what is left together is no gap."""
     kept = sorted(reasons, key=lambda one: one.alone)
     while kept:
-        together = _size(setting, base, kept, floor_nm)
+        together = _size(setting, base, kept, floors)
         if together is not None and max(together.values()) < PRESENT:
             break
         kept.pop()
@@ -666,7 +679,7 @@ def _truth(
     base: Sequence[Run],
     reasons: Sequence[Contributor],
     total: dict[str, float],
-    floor_nm: float,
+    floors: Mapping[str, float],
     form: float,
 ) -> dict[str, Any]:
     withheld = [r for r in reasons if r.role != "tolerance"]
@@ -689,14 +702,14 @@ def _truth(
         "form": form,
         "controller": setting.controller,
         "size_ratio": max(total.values()),
-        "floor_nm": floor_nm,
+        "floors_nm": dict(floors),
         "contributors": [
             {
                 "name": r.name,
                 "role": r.role,
                 "size_alone": r.alone,
                 "by_channel": r.sizes,
-                "indistinguishable": _tied(setting, base, r, floor_nm) if r.alone >= PRESENT else [],
+                "indistinguishable": _tied(setting, base, r, floors["inverse"]) if r.alone >= PRESENT else [],
             }
             for r in reasons
         ],

@@ -86,8 +86,9 @@ def diagnose(
     runs = None if replay is None else replay({}, validation=_judged_role(logs))
     nothing_nm = _negligible(nominal, channels, negligible)
     quiet = _raw_quiet(channels, negligible)
+    steps_nm = replay.steps_nm(runs, _judged_role(logs)) if replay is not None and runs is not None else 0.0
     if quiet and replay is not None and runs is not None:
-        quiet_nm = _quiet_nm(gaps, _white_nm(logs), nothing_nm)
+        quiet_nm = _quiet_nm(gaps, math.hypot(_white_nm(logs), steps_nm), nothing_nm)
         tolerable = {} if settled_nm(runs) <= quiet_nm else _tolerable(found, channels, gaps, nothing_nm)
         quiet = settled_nm(replay(tolerable, validation=_judged_role(logs)) if tolerable else runs) <= quiet_nm
     said = verdict(found, channels, gaps, nothing_nm, quiet)
@@ -95,7 +96,7 @@ def diagnose(
         reasons["stribeck"] = warning
     if replay is not None and runs is not None and said.named:
         open_along = any(gap.channel == "plant" and stays(gap, HALF, floors=1.0) for gap in gaps)
-        said, told = borne_out(said, _loop(replay, logs, runs, gaps, nothing_nm), open_along=open_along)
+        said, told = borne_out(said, _loop(replay, logs, runs, gaps, nothing_nm, steps_nm), open_along=open_along)
         if told is not None:
             reasons["closed_loop"] = told
             gaps = _closed(channels, said.named)
@@ -189,15 +190,16 @@ def _white_nm(logs: Sequence[Recording]) -> float:
     return gain * rms(np.array([white_rms(t) for r in judged if (t := r.experiment.torque_nm) is not None] or [0.0]))
 
 
-def _quiet_nm(gaps: Sequence[Closed], white_nm: float, negligible_nm: float) -> float:
-    """The torque gap of the simulated closed loop that is no more than noise: as the actuation has it, and white, N m.
+def _quiet_nm(gaps: Sequence[Closed], known_nm: float, negligible_nm: float) -> float:
+    """The torque gap of the simulated closed loop that is no more than noise, N m.
 
-    What an encoder's steps make of the torque is known in a replay, and another draw of them in a simulation.
+    Noise is as the actuation has it, or ``known_nm``, which white noise and an encoder's steps make. What the steps
+    make of the torque is known in a replay, and another draw of them in a simulation.
     """
     noise = next((gap.floor for gap in gaps if gap.channel == "actuation"), None)
     if noise is None:
         return math.inf
-    return min(FLOORS * max(noise, white_nm), max(LOUD * white_nm, negligible_nm))
+    return min(FLOORS * max(noise, known_nm), max(LOUD * known_nm, negligible_nm))
 
 
 def _tolerable(
@@ -220,10 +222,12 @@ def _loop(
     bare: Mapping[str, Replayed],
     gaps: Sequence[Closed],
     negligible_nm: float,
+    steps_nm: float,
 ) -> Loop:
     """The closed loop on the logs a gap is told of, as it judges causes."""
     role = _judged_role(logs)
-    noise_nm = max([_white_nm(logs), *(gap.floor for gap in gaps if gap.channel == "actuation")])
+    known_nm = math.hypot(_white_nm(logs), steps_nm)
+    noise_nm = max([known_nm, *(gap.floor for gap in gaps if gap.channel == "actuation")])
 
     def gap_nm(effects: Effects) -> float:
         with np.errstate(over="ignore", invalid="ignore"):

@@ -199,6 +199,8 @@ def _sides(name: str, channels: Sequence[Sampled]) -> tuple[float, float]:
     The most that other causes' forms may have put on it counts as its doubt: this decides what is said at all.
     """
     told, other, _ = _three(name, channels, "blurs")
+    if not _is_error(name, channels):
+        return float(np.mean(told)), 0.0
     home = max(channels, key=lambda c: rms(c.sizes.get(name, np.zeros(1))))
     above = home.signs[name] >= 0.0
     sides = float(np.mean(np.where(above, told, other))), float(np.mean(np.where(above, other, told)))
@@ -223,8 +225,12 @@ def _three(name: str, channels: Sequence[Sampled], doubt: str) -> tuple[Array, A
     blur = np.maximum(blur, FORM)
     parts = zip(_chances(size, blur, tolerated), _chances(size, blur, believed), strict=True)
     told, other, absent = ((1.0 - beyond) * within + beyond * whole for within, whole in parts)
-    is_error = any(t.effect == name and not t.shape for c in channels for t in c.posterior.channel.nuisances)
-    return told, is_error * other, absent
+    return told, other * _is_error(name, channels), absent
+
+
+def _is_error(name: str, channels: Sequence[Sampled]) -> bool:
+    """Whether a cause is an error of a believed number, which may lie on either side."""
+    return any(t.effect == name and not t.shape for c in channels for t in c.posterior.channel.nuisances)
 
 
 def _beyond(size: Array, lent: Array, tolerated: Array, believed: Array, prior: float) -> Array:

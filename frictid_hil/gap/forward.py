@@ -130,8 +130,23 @@ class Replay:
 
         Warmth carries over in run order, so earlier logs are simulated too where an effect remembers.
         """
-        model = self.model(effects)
         carried = any(all_effects()[name].carried for name in effects)
+        return self._replayed(self.model(effects), carried, validation)
+
+    def steps_nm(self, bare: Mapping[str, Replayed], validation: bool | None) -> float:
+        """RMS of what the encoder's steps make of the believed joint's torque, N m; ``bare`` is its replay with them.
+
+        In a closed loop they decide when a joint lets go: the recording and its simulation are two draws of it.
+        """
+        encoder = self._nominal.encoder
+        if encoder.counts_per_revolution == 0.0:
+            return 0.0
+        exact = replace(self._nominal, encoder=replace(encoder, counts_per_revolution=0.0))
+        smooth = self._replayed(exact, False, validation)
+        apart = [(bare[n].torque_nm - run.torque_nm)[run.settled :] for n, run in smooth.items()]
+        return rms(np.concatenate(apart))
+
+    def _replayed(self, model: JointModel, carried: bool, validation: bool | None) -> dict[str, Replayed]:
         state: CarryOver | None = None
         result: dict[str, Replayed] = {}
         for experiment in self._experiments:

@@ -109,8 +109,8 @@ def _beyond_tolerance(cause: Finding, channels: Sequence[Sampled]) -> float:
 
 
 def _certain(cause: Finding, channels: Sequence[Sampled], gaps: Sequence[Closed]) -> bool:
-    """Whether no doubt is left of a cause and of its name, small as it is, and the gap of its channel falls with it."""
-    falls = any(gap.channel == cause.where and gap.high < gap.before for gap in gaps)
+    """Whether no doubt is left of a cause and of its name, small as it is, and it takes half of its channel's gap."""
+    falls = any(gap.channel == cause.where and not stays(gap, HALF, floors=1.0) for gap in gaps)
     return falls and min(cause.chance, cause.leads, _beyond_tolerance(cause, channels)) >= CERTAIN
 
 
