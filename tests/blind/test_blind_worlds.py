@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,21 @@ def test_what_is_withheld_is_there_and_the_largest(drawn: tuple[Any, Any, dict[s
     assert withheld["size_alone"] >= wide.WITHHELD and withheld["size_alone"] == max(sizes.values())
     for name in truth["neutral"]:
         assert name in wide.FORMS or wide.NOTHING <= sizes[name] < wide.PRESENT
+
+
+@pytest.mark.slow
+def test_a_softer_presliding_shows_along_the_motion_and_hardly_in_the_loop() -> None:
+    made = (wide._setting(np.random.default_rng([3, n])) for n in range(50))
+    setting = next(s for s in made if s.controller == "known" and s.physics.gear_ratio > 50.0)
+    base = wide._runs(setting, setting.physics, setting.control)
+    assert base is not None
+    floors = wide._floors(setting, base)
+    assert floors is not None and floors["inverse"] >= floors["actuation"]
+    softer = wide.Contributor("presliding_hysteresis", "tolerance", {}, wide._scaling({"slip_length": 1.1}))
+    sizes = wide._size(setting, base, [softer], floors)
+    assert sizes is not None and sizes["inverse"] > 3.0 * sizes["torque"]
+    # Where nobody knows the controller, nobody can simulate its loop.
+    assert set(wide._floors(replace(setting, controller="unknown"), base) or {}) == {"inverse"}
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pytest
 
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import ExperimentSet
-from frictid_hil.gap.forward import Replay, pooled
+from frictid_hil.gap.forward import Replay, pooled, settled_nm
 from frictid_hil.gap.residuals import LowPass, recordings, rms
 
 SINGLES = {
@@ -187,6 +187,24 @@ def test_improved_model_closes_the_gap_in_the_simulator() -> None:
     assert set(model.effects) == {"direction_asymmetry"}
     left = pooled(Replay(experiments)(model.effects, validation=True), "torque_nm")
     assert left == pytest.approx(d.after.forward_torque_nm, rel=1e-6)
+
+
+def test_an_encoders_steps_make_about_what_sets_two_joints_with_other_counts_apart(healthy: ExperimentSet) -> None:
+    made_nm = []
+    for step_rad in (None, 1e-4, 3e-4):
+        nominal = replace(healthy.nominal, encoder_resolution_rad=step_rad)
+        replay = Replay(replace(healthy, nominal=nominal))
+        made_nm.append(replay.steps_nm(replay({}, validation=True), True))
+    elsewhere = [
+        replace(e, position_command_rad=e.position_command_rad + 1.2e-4)
+        for e in healthy.experiments
+        if e.position_command_rad is not None
+    ]
+    here = replay({}, validation=True)
+    there = Replay(replace(healthy, nominal=nominal, experiments=tuple(elsewhere)))({}, validation=True)
+    apart_nm = settled_nm({n: replace(run, torque_nm=run.torque_nm - there[n].torque_nm) for n, run in here.items()})
+    assert made_nm[0] == 0.0 < 2.0 * made_nm[1] < made_nm[2]
+    assert 1.0 < apart_nm / made_nm[2] < 2.0  # of two draws, the root of two
 
 
 @pytest.mark.slow

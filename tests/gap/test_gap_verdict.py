@@ -1,0 +1,76 @@
+"""What is said of draws that are given: the rules of the verdict, each by itself."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from frictid_hil.gap.channel import Term
+from frictid_hil.gap.findings import DRAWS, SIDED, Finding, Sampled, findings
+from frictid_hil.gap.how_far import Closed
+from frictid_hil.gap.verdict import verdict
+
+CAUSE = "torque_saturation"
+ERROR = "gravity_error"
+NEGLIGIBLE = 1.2  # between one floor and two
+
+
+def channel(name: str, cause: str, size: float, signs: np.ndarray, *, between_rows: bool = False) -> Sampled:
+    """Draws that all hold one cause of a size, in floors, with the signs of its coefficient."""
+    term = Term(cause, {}, (0,), np.zeros(1), np.ones(1))
+    nuisances = (term,) if cause == ERROR else ()
+    held = SimpleNamespace(name=name, nuisances=nuisances, between_rows=between_rows, logs=(), level_free=False)
+    posterior: Any = SimpleNamespace(
+        channel=held,
+        chance=0.03,
+        floor=1.0,
+        terms=lambda model: [term],
+        contributions=lambda draw: {cause: (np.zeros(1, dtype=int), draw.values)},
+    )
+    draws: Any = [
+        SimpleNamespace(model=SimpleNamespace(effects=frozenset([cause])), values=np.array([size * s])) for s in signs
+    ]
+
+    def each(value: float) -> dict[str, np.ndarray]:
+        return {cause: np.full(DRAWS, value)}
+
+    sizes = each(size)
+    return Sampled(
+        posterior, draws, sizes, {cause: signs}, each(0.1), each(0.1), each(10.0), each(10.0),
+        np.zeros(DRAWS), sizes[cause], np.ones((1, 1)),
+    )  # fmt: skip
+
+
+def sure(size: float) -> Finding:
+    return Finding(CAUSE, 0.99, 0.99, size, 0.99, {}, (), "plant")
+
+
+@pytest.mark.parametrize(("size", "word"), [(8.8, "explained"), (0.9, "none")])
+def test_a_cause_that_identification_logs_hold_outweighs_a_channel_that_is_faint_in_the_others(
+    size: float, word: str
+) -> None:
+    drawn = channel("plant", CAUSE, size, np.ones(DRAWS), between_rows=True)
+    gap = Closed("plant", 1.9, 1.0, 0.99, 1.01, floor=1.0)
+    assert verdict([sure(size)], [drawn], [gap], NEGLIGIBLE, otherwise_quiet=True).word == word
+
+
+@pytest.mark.parametrize(("after", "word"), [(1.1, "explained"), (1.75, "none")])
+def test_a_sure_cause_within_noise_is_told_if_it_takes_half_of_the_gap(after: float, word: str) -> None:
+    drawn = channel("plant", CAUSE, 0.95, np.ones(DRAWS))
+    gap = Closed("plant", 1.99, after, after, after, floor=1.0)
+    assert verdict([sure(0.95)], [drawn], [gap], NEGLIGIBLE, otherwise_quiet=True).word == word
+
+
+@pytest.mark.parametrize("above", [0.5, 0.7, 0.8, 0.2, 1.0])
+def test_an_error_is_listed_where_the_draws_agree_on_its_sign(above: float) -> None:
+    signs = np.where(np.arange(DRAWS) < above * DRAWS, 1.0, -1.0)
+    found = findings([channel("plant", ERROR, 3.0, signs)])
+    assert [f.effect for f in found] == ([ERROR] if max(above, 1.0 - above) >= SIDED else [])
+
+
+def test_what_is_no_error_of_the_belief_has_no_sides() -> None:
+    signs = np.where(np.arange(DRAWS) % 2, 1.0, -1.0)
+    assert [f.effect for f in findings([channel("plant", CAUSE, 3.0, signs)])] == [CAUSE]
