@@ -85,7 +85,8 @@ def verdict(
     # where those functions make more of it.
     untold = unnamed and any(stays(gap, REMAINS) for gap in gaps)
     if nothing or generic_wins or untold or new or any(_open(gap, negligible) for gap in gaps):
-        return Verdict("unknown", named, place)
+        # A link that swings may be no help along the motion, and close the loop all the same.
+        return Verdict("unknown", named or tuple(f for f in found if f.chance >= LISTED and swings(f.effect)), place)
     if (varies := next((f for f in named if f.chance >= EVEN and _varies(f, channels)), None)) is not None:
         return Verdict("unknown", named, f"{varies.where}: {varies.effect} that comes and goes")
     if unnamed or any(stays(gap, REMAINS) for gap in gaps):
@@ -158,6 +159,12 @@ def _first_with(cause: Finding, channels: Sequence[Sampled]) -> tuple[Sampled, D
     """The channel in which a cause shows most, with its first draw that holds the cause."""
     home = [c for c in channels if c.posterior.channel.name == cause.where]
     return next(((c, d) for c in home for d in c.draws if cause.effect in d.model.effects), None)
+
+
+def swings(cause: str) -> bool:
+    """Whether a cause lets the link swing, so that its columns along a motion may lose the link's phase."""
+    form = all_effects()[cause].inverse
+    return form is not None and form.swings
 
 
 def _varies(cause: Finding, channels: Sequence[Sampled]) -> bool:

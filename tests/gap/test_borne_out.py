@@ -173,3 +173,24 @@ def test_elasticity_that_the_motion_tells_badly_is_rescued_by_the_loop() -> None
         borne_out(Verdict("unknown", (cause("torque_bias", bias_nm=0.1),)), loop({"torque_bias": 0.1}))[0].word
         == "unknown"
     )
+
+
+def test_play_beside_another_cause_is_refined_too_and_may_leave_a_third() -> None:
+    """Play whose columns told two thirds of its gap stood second, and the loop that it closes was `unknown`."""
+    play = cause("backlash", gap_rad=1.5e-3, contact_stiffness_nm_per_rad=2e5, contact_relaxation_s=3e-3)
+    named = (cause("stribeck"), cause("temperature_drift"), play)
+
+    def gap_nm(effects: Effects) -> float:
+        gap = 3.0 if "stribeck" in effects else 1.0
+        gap -= 0.3 if "temperature_drift" in effects else 0.0
+        if "backlash" in effects:
+            gap -= 0.4 - 300.0 * abs(effects["backlash"]["gap_rad"] - 2.1e-3)
+        return gap
+
+    said, _ = borne_out(Verdict("explained", named), Loop(gap_nm, 1.0, 0.02))
+    assert said.word == "explained"
+    assert {f.effect for f in said.named[:2]} == {"temperature_drift", "backlash"}
+    (backlash,) = [f for f in said.named if f.effect == "backlash"]
+    assert backlash.parameters["gap_rad"].value == pytest.approx(2.1e-3, rel=0.01)
+    left = loop({"stribeck": 3.0, "torque_bias": 0.3, "stribeck+torque_bias": 3.0})
+    assert borne_out(Verdict("explained", (cause("stribeck"), cause("torque_bias"))), left)[0].word == "unknown"
