@@ -56,7 +56,7 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
     if not refuted and said.word == "unknown" and kept == [said.named[0].effect]:
         return _rescued(said, values, loop, gap_nm)
     open_still = gap_nm**2 - loop.floor_nm**2 > HALF**2 * loop.visible
-    read = {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
+    read = {f.effect for f in said.named if f.where == READ_DIRECTLY or of_the_drive(f)}
     shows = gap_nm > FLOORS * loop.floor_nm and (not kept or gap_nm > loop.negligible_nm)
     leans = bool(kept and refuted)
     if (open_along or leans) and open_still and shows and not read and said.word != "unknown":
@@ -86,7 +86,7 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
 
 def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm: float, loop: Loop) -> set[str]:
     """Causes that do harm: ``HALF`` of the visible gap, or ``REMAINS`` both beside the chosen ones and among all."""
-    spared = {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
+    spared = {f.effect for f in said.named if f.where == READ_DIRECTLY or of_the_drive(f)}
     added = {n: (nm**2 - gap_nm**2) / loop.visible for n, nm in beside.items() if n not in spared}
     refuted = {name for name, share in added.items() if share > HALF**2}
     some = {name for name, share in added.items() if share > REMAINS**2} - refuted - {said.named[0].effect}
@@ -111,7 +111,7 @@ def _doubted(said: Verdict) -> Verdict:
     return replace(said, named=tuple(f.at_most(DOUBTED) for f in said.named))
 
 
-def _of_the_drive(cause: Finding) -> bool:
+def of_the_drive(cause: Finding) -> bool:
     """Whether a cause acts between demand and torque: it is seen by itself, and where a drive reports may differ."""
     return all_effects()[cause.effect].actuation is not None
 

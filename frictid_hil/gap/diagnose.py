@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replayed
-from frictid_hil.gap.borne_out import Loop, borne_out
+from frictid_hil.gap.borne_out import Loop, borne_out, of_the_drive
 from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, ONE_SINUSOID, below_first_pair, one_sinusoid
 from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.command_timing import in_force
@@ -21,6 +21,7 @@ from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment,
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import Finding, Sampled, either_way, findings, sampled, whole_draws
 from frictid_hil.gap.forward import Effects, Replay, Replayed, settled_nm, why_not
+from frictid_hil.gap.hidden import hidden
 from frictid_hil.gap.how_far import Closed, closed, held_out, simulated
 from frictid_hil.gap.kinematics import fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
@@ -94,9 +95,9 @@ def diagnose(
     said = verdict(found, channels, gaps, nothing_nm, quiet)
     if (warning := below_first_pair(said.named, nominal.curve)) is not None:
         reasons["stribeck"] = warning
-    if replay is not None and runs is not None and said.named:
-        open_along = any(gap.channel == "plant" and stays(gap, HALF, floors=1.0) for gap in gaps)
-        said, told = borne_out(said, _loop(replay, logs, runs, gaps, nothing_nm, steps_nm), open_along=open_along)
+    if replay is not None and runs is not None and said.word != "none":
+        loop = _loop(replay, logs, runs, gaps, nothing_nm, steps_nm)
+        said, told = _in_the_loop(said, channels, replay, loop, gaps)
         if told is not None:
             reasons["closed_loop"] = told
             gaps = _closed(channels, said.named)
@@ -236,6 +237,31 @@ def _loop(
         return gap if math.isfinite(gap) else math.inf
 
     return Loop(gap_nm, settled_nm(bare), noise_nm, negligible_nm)
+
+
+def _in_the_loop(
+    said: Verdict, channels: Sequence[Sampled], replay: Replay, loop: Loop, gaps: Sequence[Closed]
+) -> tuple[Verdict, str | None]:
+    """The verdict as the simulated closed loop has it, and what to tell of that."""
+    told: str | None = None
+    if said.named:
+        open_along = any(gap.channel == "plant" and stays(gap, HALF, floors=1.0) for gap in gaps)
+        said, told = borne_out(said, loop, open_along=open_along)
+    plant = next((c for c in channels if c.posterior.channel.name == "plant"), None)
+    drive = [f for f in said.named if said.word == "explained" and of_the_drive(f) and f.parameters]
+    quiet = all(gap.before <= FLOORS * gap.floor for gap in gaps if gap.channel == "plant")
+    if plant is None or not quiet or (said.word != "unknown" and len(drive) < len(said.named)):
+        return said, told
+    beside = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in drive}
+    found = hidden(plant.posterior.channel.candidates, replay, loop, beside)
+    if found is None:
+        return said, told
+    named = tuple(sorted([*found[0], *drive], key=lambda f: -f.size))
+    names = " and ".join(f.effect for f in named)
+    return Verdict("explained", named), (
+        f"noise hides along the motion what the simulated torque of the validation logs shows: "
+        f"it is {loop.before_nm:.3g} N m off, {found[1]:.3g} with {names}"
+    )
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:

@@ -70,7 +70,8 @@ def plant_channel(
         first = min(held // low_pass.stride + 1, len(range(0, residual.size, low_pass.stride)) // 3)
         rows.append(rows_of(r, columns, residual, low_pass, first=first, known_noise=noise, report=report))
     step_s, white = logs[0].step_s * low_pass.stride, white_nm(logs, low_pass)
-    rows = _told(without_nuisances(rows, known, candidates), white, views[0].coulomb_nm, step_s)
+    rows = [_no_louder(row) for row in without_nuisances(rows, known, candidates)]
+    rows = _told(rows, white, views[0].coulomb_nm, step_s)
     raw = _raw(logs, residuals, noises)
     known_floor = math.hypot(white, rms(np.concatenate([log.known_noise[log.told] for log in rows])))
     return Channel(
@@ -137,6 +138,12 @@ def white_nm(logs: Sequence[Recording], low_pass: LowPass) -> float:
     """RMS that white noise of the torque leaves behind the low-pass, N m."""
     white = [white_rms(t) for r in logs if (t := r.experiment.torque_nm) is not None]
     return low_pass.white_gain * rms(np.array(white))
+
+
+def _no_louder(row: Rows) -> Rows:
+    """A log whose known noise is no louder than its residual: a coarse count that stands still makes none."""
+    heard, known = rms(row.y), rms(row.known_noise)
+    return row if known <= heard else replace(row, known_noise=row.known_noise * (heard / known))
 
 
 def _told(rows: Sequence[Rows], white_nm: float, coulomb_nm: float, step_s: float) -> list[Rows]:
