@@ -41,6 +41,7 @@ from frictid_hil.gap.verdict import (
     HALF,
     READ_DIRECTLY,
     STANDS_OUT,
+    TIED,
     Verdict,
     as_stated,
     expected,
@@ -56,7 +57,6 @@ NEGLIGIBLE = 0.05
 LOUD = 3.0
 """Gap of the closed loop over white noise, above which it is no noise: a slow part eight times as strong in power."""
 READ = 0.97  # chance of what is read from reported positions and velocities themselves
-TIED = 0.45  # chance of each of two causes that a motion makes alike, a little left for a third
 UNDECIDED = 0.5  # most that is claimed of causes that a motion or the lack of a second log cannot tell apart
 
 
@@ -258,7 +258,7 @@ def _in_the_loop(
         return said, told
     named = tuple(sorted([*found[0], *drive], key=lambda f: -f.size))
     names = " and ".join(f.effect for f in named)
-    return Verdict("explained", named), (
+    return Verdict("ambiguous" if any(f.rivals for f in found[0]) else "explained", named), (
         f"noise hides along the motion what the simulated torque of the validation logs shows: "
         f"it is {loop.before_nm:.3g} N m off, {found[1]:.3g} with {names}"
     )

@@ -7,9 +7,10 @@ describes most first. They are told only if with those numbers the joint of the 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from frictid_hil.gap.findings import Finding
 from frictid_hil.gap.forward import Effects, Replay
 from frictid_hil.gap.posterior import FORM
 from frictid_hil.gap.residuals import rms
-from frictid_hil.gap.verdict import DOUBTED, FLOORS, REMAINS
+from frictid_hil.gap.verdict import DOUBTED, FLOORS, REMAINS, TIED
 from frictid_hil.simulation.effects import all_effects
 
 MOST = 4  # causes that are told together at most
@@ -51,16 +52,32 @@ def hidden(
     steps = [step for step in _steps(candidates) if step[0] not in beside]
     ways = [Way(e, p, s, rest - _torque_nm(replay, {**beside, e: {p: s}})) for e, p, s in steps]
     ways = [way for way in ways if np.all(np.isfinite(way.changed_nm))]
-    visible = max(before_nm**2 - loop.floor_nm**2, loop.floor_nm**2)
-    for chosen in _sets(ways, rest, loop.floor_nm):
-        strengths, _ = _fitted(chosen, rest, loop.floor_nm)
-        # A loop is not quite linear: the rest that those numbers leave is fitted once more.
-        again = _torque_nm(replay, {**beside, **_values(chosen, strengths)})
-        more, spread = _fitted(chosen, again, loop.floor_nm)
-        gap_nm = loop.gap_nm({**beside, **_values(chosen, strengths + more)})
-        if gap_nm**2 - loop.floor_nm**2 <= REMAINS**2 * visible:
-            return _findings(chosen, strengths + more, spread, loop.floor_nm), gap_nm
+    most_nm2 = loop.floor_nm**2 + REMAINS**2 * max(before_nm**2 - loop.floor_nm**2, loop.floor_nm**2)
+    for sets in _sets(ways, rest, loop.floor_nm):
+        closing = []
+        for chosen in sets:
+            strengths, _ = _fitted(chosen, rest, loop.floor_nm)
+            # A loop is not quite linear: the rest that those numbers leave is fitted once more.
+            again = _torque_nm(replay, {**beside, **_values(chosen, strengths)})
+            more, spread = _fitted(chosen, again, loop.floor_nm)
+            gap_nm = loop.gap_nm({**beside, **_values(chosen, strengths + more)})
+            if gap_nm**2 <= most_nm2:
+                closing.append((gap_nm, _findings(chosen, strengths + more, spread, loop.floor_nm)))
+        if closing:
+            closing.sort(key=lambda one: one[0])
+            alike = [found for gap_nm, found in closing if gap_nm <= (1.0 + FORM) * closing[0][0]]
+            return _or_tied(alike), closing[0][0]
     return None
+
+
+def _or_tied(closing: Sequence[list[Finding]]) -> list[Finding]:
+    """The causes that close the loop best; where as many others close it as well, each may stand for the other."""
+    best = closing[0]
+    everywhere = set.intersection(*({f.effect for f in found} for found in closing))
+    others = {f.effect: f for found in closing[1:] for f in found if f.effect not in {one.effect for one in best}}
+    mine = tuple(f.effect for f in best if f.effect not in everywhere)
+    told = [replace(f.at_most(TIED), rivals=tuple(others)) if f.effect in mine else f for f in best]
+    return [*told, *(replace(f.at_most(TIED), rivals=mine) for f in others.values())]
 
 
 def _torque_nm(replay: Replay, effects: Effects) -> Array:
@@ -82,20 +99,23 @@ def _steps(candidates: Sequence[Term]) -> list[tuple[str, str, float]]:
     return found
 
 
-def _sets(ways: Sequence[Way], rest: Array, floor_nm: float) -> list[list[Way]]:
-    """What may describe the rest: the best single ways, the plainest answer, then sets grown one way at a time."""
+def _sets(ways: Sequence[Way], rest: Array, floor_nm: float) -> list[list[list[Way]]]:
+    """What may describe the rest, the plainest first: the best single ways, the best pairs, what the best one grows to.
+
+    A wrong way that is a little of two right ones may describe more than either; so all pairs are compared.
+    """
 
     def left(some: Sequence[Way]) -> float:
         return rms(rest - _made(some, _fitted(some, rest, floor_nm)[0]))
 
-    singles = sorted(([way] for way in ways), key=left)[:MOST]
-    grown, sets = list(singles[0]) if singles else [], list(singles)
+    sets = [sorted((list(some) for some in itertools.combinations(ways, n)), key=left)[:MOST] for n in (1, 2)]
+    grown = min(itertools.chain(*sets), key=left, default=[])
     worth = REMAINS**2 * max((rms(rest) if rest.size else 0.0) ** 2 - floor_nm**2, 0.0)
     while grown and len(grown) < MOST:
         larger = min(([*grown, way] for way in ways if way not in grown), key=left, default=grown)
         if left(grown) ** 2 - left(larger) ** 2 <= worth:
             break
-        sets.append(larger)
+        sets.append([larger])
         grown = larger
     return sets
 

@@ -30,6 +30,7 @@ a name would describe as well: less than what counts as sure. Of 41 drawn causes
 HALF = 0.5  # part of a gap from which on it is open although causes were named
 HELPS = 0.98  # gap of the validation logs with the causes over that without, above which they explain nothing there
 READ_DIRECTLY = "kinematics"  # where a cause is read from positions and velocities themselves
+TIED = 0.45  # chance of each of two causes that recordings make alike, a little left for a third
 LISTED = 0.25  # chance from which a cause is listed
 NEEDED = 0.85
 """Chance that no tolerance makes up for a cause, from which it is told however small the gap is in practice."""
