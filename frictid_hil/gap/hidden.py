@@ -20,12 +20,14 @@ from frictid_hil.gap.channel import FAMILY, Term
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Finding
 from frictid_hil.gap.forward import Effects, Replay
+from frictid_hil.gap.plainest import CANCELS
 from frictid_hil.gap.posterior import FORM
 from frictid_hil.gap.residuals import rms
 from frictid_hil.gap.verdict import DOUBTED, FLOORS, REMAINS, TIED
 from frictid_hil.simulation.effects import all_effects
 
 MOST = 4  # causes that are told together at most
+ROUNDS = 2  # times that what the strengths leave is fitted once more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +37,8 @@ class Way:
     effect: str
     parameter: str
     step: float  # about as much as the cause may well be
+    least: float  # of the number, in steps: what is below or above makes no sense
+    largest: float
     changed_nm: Array  # of the simulated torque with one such step, shape (n,)
 
 
@@ -49,25 +53,40 @@ def hidden(
     if before_nm <= FLOORS * loop.floor_nm:
         return None
     rest = _torque_nm(replay, beside)
+    if rest.size == 0:
+        return None
     steps = [step for step in _steps(candidates) if step[0] not in beside]
-    ways = [Way(e, p, s, rest - _torque_nm(replay, {**beside, e: {p: s}})) for e, p, s in steps]
+    ways = [_way(*step, rest, replay, beside) for step in steps]
     ways = [way for way in ways if np.all(np.isfinite(way.changed_nm))]
     most_nm2 = loop.floor_nm**2 + REMAINS**2 * max(before_nm**2 - loop.floor_nm**2, loop.floor_nm**2)
     for sets in _sets(ways, rest, loop.floor_nm):
         closing = []
         for chosen in sets:
-            strengths, _ = _fitted(chosen, rest, loop.floor_nm)
-            # A loop is not quite linear: the rest that those numbers leave is fitted once more.
-            again = _torque_nm(replay, {**beside, **_values(chosen, strengths)})
-            more, spread = _fitted(chosen, again, loop.floor_nm)
-            gap_nm = loop.gap_nm({**beside, **_values(chosen, strengths + more)})
+            strengths, gap_nm = _closest(chosen, rest, replay, loop, beside)
             if gap_nm**2 <= most_nm2:
-                closing.append((gap_nm, _findings(chosen, strengths + more, spread, loop.floor_nm)))
+                closing.append((gap_nm, _findings(chosen, strengths, loop.floor_nm)))
         if closing:
             closing.sort(key=lambda one: one[0])
             alike = [found for gap_nm, found in closing if gap_nm <= (1.0 + FORM) * closing[0][0]]
             return _or_tied(alike), closing[0][0]
     return None
+
+
+def _closest(ways: Sequence[Way], rest: Array, replay: Replay, loop: Loop, beside: Effects) -> tuple[Array, float]:
+    """(strengths that bring the loop nearest, its gap with them, N m).
+
+    A loop is not quite linear: what the strengths leave of the identification logs is fitted once more, and again.
+    """
+    strengths, _ = _fitted(ways, rest, loop.floor_nm)
+    best, best_nm = strengths, math.inf
+    for _ in range(ROUNDS):
+        again = _torque_nm(replay, {**beside, **_values(ways, strengths)})
+        strengths = strengths + _fitted(ways, again, loop.floor_nm)[0]
+        gap_nm = loop.gap_nm({**beside, **_values(ways, strengths)})
+        if not gap_nm < best_nm:
+            break
+        best, best_nm = strengths, gap_nm
+    return best, best_nm
 
 
 def _or_tied(closing: Sequence[list[Finding]]) -> list[Finding]:
@@ -92,11 +111,18 @@ def _steps(candidates: Sequence[Term]) -> list[tuple[str, str, float]]:
     found = []
     for term in candidates:
         form = all_effects()[term.effect].inverse if not term.effect.startswith(FAMILY) else None
-        if form is None or term.shape or form.shapes != ({},):
+        if form is None or any(term.shape.values()):
             continue
-        for name, value in form.parameters({}, term.deviation).items():
-            found.append((term.effect, name, abs(value)))
+        for name, value in form.parameters(term.shape, term.deviation).items():
+            if value and name not in term.shape:
+                found.append((term.effect, name, abs(value)))
     return found
+
+
+def _way(effect: str, parameter: str, step: float, rest: Array, replay: Replay, beside: Effects) -> Way:
+    (limits,) = [p for p in all_effects()[effect].parameters if p.name == parameter]
+    changed_nm = rest - _torque_nm(replay, {**beside, effect: {parameter: step}})
+    return Way(effect, parameter, step, limits.lower / step, limits.upper / step, changed_nm)
 
 
 def _sets(ways: Sequence[Way], rest: Array, floor_nm: float) -> list[list[list[Way]]]:
@@ -106,11 +132,15 @@ def _sets(ways: Sequence[Way], rest: Array, floor_nm: float) -> list[list[list[W
     """
 
     def left(some: Sequence[Way]) -> float:
-        return rms(rest - _made(some, _fitted(some, rest, floor_nm)[0]))
+        strengths, _ = _fitted(some, rest, floor_nm)
+        inside = all(way.least <= strength <= way.largest for way, strength in zip(some, strengths, strict=True))
+        made, parts = _made(some, strengths), [_made([w], [k]) for w, k in zip(some, strengths, strict=True)]
+        cancel = rms(made) ** 2 < CANCELS * max(rms(part) for part in parts) ** 2
+        return rms(rest - made) if inside and not cancel else math.inf
 
     sets = [sorted((list(some) for some in itertools.combinations(ways, n)), key=left)[:MOST] for n in (1, 2)]
     grown = min(itertools.chain(*sets), key=left, default=[])
-    worth = REMAINS**2 * max((rms(rest) if rest.size else 0.0) ** 2 - floor_nm**2, 0.0)
+    worth = REMAINS**2 * max(rms(rest) ** 2 - floor_nm**2, 0.0)
     while grown and len(grown) < MOST:
         larger = min(([*grown, way] for way in ways if way not in grown), key=left, default=grown)
         if left(grown) ** 2 - left(larger) ** 2 <= worth:
@@ -127,8 +157,8 @@ def _fitted(ways: Sequence[Way], rest: Array, floor_nm: float) -> tuple[Array, A
     return covariance @ (columns.T @ rest / floor_nm), np.sqrt(np.diag(covariance))
 
 
-def _made(ways: Sequence[Way], strengths: Array) -> Array:
-    made: Array = np.stack([way.changed_nm for way in ways], axis=1) @ strengths
+def _made(ways: Sequence[Way], strengths: Sequence[float] | Array) -> Array:
+    made: Array = np.stack([way.changed_nm for way in ways], axis=1) @ np.asarray(strengths)
     return made
 
 
@@ -139,10 +169,11 @@ def _values(ways: Sequence[Way], strengths: Array) -> dict[str, dict[str, float]
     return values
 
 
-def _findings(ways: Sequence[Way], strengths: Array, spread: Array, floor_nm: float) -> list[Finding]:
+def _findings(ways: Sequence[Way], strengths: Array, floor_nm: float) -> list[Finding]:
     """Causes with what each makes of the loop's torque; no joint is quite as its form, and steps are another draw."""
     parameters: dict[str, dict[str, Value]] = {}
     made: dict[str, Array] = {}
+    _, spread = _fitted(ways, np.zeros_like(ways[0].changed_nm), floor_nm)
     for way, strength, sigma in zip(ways, strengths, spread, strict=True):
         value, half = float(strength) * way.step, 1.96 * math.hypot(float(sigma), FORM * float(strength)) * way.step
         parameters.setdefault(way.effect, {})[way.parameter] = Value(value, value - half, value + half)
