@@ -128,7 +128,8 @@ def _way(effect: str, parameter: str, step: float, rest: Array, replay: Replay, 
 def _sets(ways: Sequence[Way], rest: Array, floor_nm: float) -> list[list[list[Way]]]:
     """What may describe the rest, the plainest first: the best single ways, the best pairs, what the best one grows to.
 
-    A wrong way that is a little of two right ones may describe more than either; so all pairs are compared.
+    A wrong way that is a little of two right ones may describe more than either; so all pairs are compared. Numbers
+    beyond their bounds describe nothing, nor do ways that mostly cancel.
     """
 
     def left(some: Sequence[Way]) -> float:
@@ -138,12 +139,15 @@ def _sets(ways: Sequence[Way], rest: Array, floor_nm: float) -> list[list[list[W
         cancel = rms(made) ** 2 < CANCELS * max(rms(part) for part in parts) ** 2
         return rms(rest - made) if inside and not cancel else math.inf
 
-    sets = [sorted((list(some) for some in itertools.combinations(ways, n)), key=left)[:MOST] for n in (1, 2)]
+    sets = []
+    for size in (1, 2):
+        able = [list(some) for some in itertools.combinations(ways, size) if math.isfinite(left(some))]
+        sets.append(sorted(able, key=left)[:MOST])
     grown = min(itertools.chain(*sets), key=left, default=[])
     worth = REMAINS**2 * max(rms(rest) ** 2 - floor_nm**2, 0.0)
     while grown and len(grown) < MOST:
         larger = min(([*grown, way] for way in ways if way not in grown), key=left, default=grown)
-        if left(grown) ** 2 - left(larger) ** 2 <= worth:
+        if not left(grown) ** 2 - left(larger) ** 2 > worth:
             break
         sets.append([larger])
         grown = larger
