@@ -72,9 +72,10 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
     stands.sort(key=lambda f: kept.index(f.effect) if f.effect in kept else len(kept))
     stands = [f if f.where == READ_DIRECTLY else f.at_most(DOUBTED) for f in stands]
     helping = {name: values[name] for name in kept}
-    for k, one in enumerate(f for f in tuple(stands) if f.effect in kept):
-        stands[k], gap_nm = _refined(one, helping, loop, gap_nm)
-        helping[one.effect] = {name: v.value for name, v in stands[k].parameters.items()}
+    for k, one in enumerate(stands):
+        if one.effect in kept:
+            stands[k], gap_nm = _refined(one, helping, loop, gap_nm)
+            helping[one.effect] = {name: v.value for name, v in stands[k].parameters.items()}
     told = _told(kept, refuted, loop, gap_nm)
     may_stay = BOUNCED if any(swings(name) for name in kept) else REMAINS
     left = max(0.0, gap_nm**2 - loop.floor_nm**2)
