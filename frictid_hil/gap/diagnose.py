@@ -406,7 +406,8 @@ def _next(
 def _summary(name: str, said: Verdict, there: str, gaps: Sequence[Closed], loop: str | None) -> str:
     if said.word == "none":
         return f"{name}: no gap beyond noise and what counts as none."
-    likely = [f for f in said.named if f.confidence >= UNDECIDED] or said.named
+    least = TIED if said.word == "ambiguous" else UNDECIDED  # what stands for one another is told together
+    likely = [f for f in said.named if f.confidence >= least] or said.named
     effects = ", ".join(f"{f.effect} ({f.confidence:.2f})" for f in likely)
     place = f"{there}; " if there else ""
     if said.word == "unknown":
