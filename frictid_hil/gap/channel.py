@@ -53,7 +53,7 @@ class Rows:
 class Channel:
     """A channel of one set."""
 
-    name: str  # ``plant``, ``actuation`` or ``tracking``
+    name: str  # ``plant``, ``loop``, ``actuation`` or ``tracking``
     step_s: float  # of the rows
     logs: tuple[Rows, ...]  # in run order
     nuisances: tuple[Term, ...]  # what the belief may be wrong by within its tolerance; always in
@@ -67,9 +67,14 @@ class Channel:
     between_rows: bool = False
 
     @property
+    def of_the_joint(self) -> bool:
+        """Its residual is a torque at the joint, which the inverse forms of effects describe."""
+        return self.name in ("plant", "loop")
+
+    @property
     def level_free(self) -> bool:
-        """The level of a log is free but along the motion, so that a constant there is no size."""
-        return self.name != "plant"
+        """The level of a log is free, so that a constant there is no size."""
+        return not self.of_the_joint
 
     @property
     def fitted(self) -> tuple[Rows, ...]:

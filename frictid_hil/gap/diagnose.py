@@ -7,7 +7,7 @@ says, and the gap on the validation logs, make the verdict.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,10 +20,10 @@ from frictid_hil.gap.command_timing import in_force
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw, Value
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import Finding, Sampled, either_way, findings, sampled, whole_draws
-from frictid_hil.gap.forward import Effects, Replay, Replayed, settled_nm, why_not
-from frictid_hil.gap.hidden import hidden
+from frictid_hil.gap.forward import Replay, Replayed, Simulation, settled_nm, why_not
 from frictid_hil.gap.how_far import Closed, closed, held_out, simulated
 from frictid_hil.gap.kinematics import fit_kinematics
+from frictid_hil.gap.loop_channel import loop_channel
 from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.position_noise import white_rms
@@ -56,6 +56,9 @@ NEGLIGIBLE = 0.05
 """Gap that means nothing in practice, over the friction level: friction repeats to about this from day to day."""
 LOUD = 3.0
 """Gap of the closed loop over white noise, above which it is no noise: a slow part eight times as strong in power."""
+COARSE = 0.7
+"""Noise of the closed loop over that along the motion, half in power, below which a quiet motion may hide a cause."""
+HIDES = "its steps hide along the motion what the controller answers to: causes are read from the closed loop's torque"
 READ = 0.97  # chance of what is read from reported positions and velocities themselves
 UNDECIDED = 0.5  # most that is claimed of causes that a motion or the lack of a second log cannot tell apart
 
@@ -78,31 +81,36 @@ def diagnose(
     logs = recordings(experiments)
     nominal = experiments.nominal
     kinematic = fit_kinematics(logs, nominal.encoder_resolution_rad, nominal.velocity_filter_s, allowed)
-    replay = Replay(experiments) if why_not(experiments) is None else None
-    believed = _believed(experiments, replay)
+    simulation = _simulation(experiments, logs)
+    believed = _believed(experiments, simulation)
     found_in = _channels(nominal, logs, allowed, reasons, kinematic, believed)
     channels = [sampled(Posterior(c, len(allowed))) for c in found_in]
     found = _with_readings(findings(channels), kinematic, logs, channels, nominal)
     gaps = _closed(channels, found)
-    runs = None if replay is None else replay({}, validation=_judged_role(logs))
     nothing_nm = _negligible(nominal, channels, negligible)
     quiet = _raw_quiet(channels, negligible)
-    steps_nm = replay.steps_nm(runs, _judged_role(logs)) if replay is not None and runs is not None else 0.0
-    if quiet and replay is not None and runs is not None:
-        quiet_nm = _quiet_nm(gaps, math.hypot(_white_nm(logs), steps_nm), nothing_nm)
-        tolerable = {} if settled_nm(runs) <= quiet_nm else _tolerable(found, channels, gaps, nothing_nm)
-        quiet = settled_nm(replay(tolerable, validation=_judged_role(logs)) if tolerable else runs) <= quiet_nm
+    along = None
+    if simulation is not None and believed and _hides(channels[0], gaps[0], simulation):
+        reasons["encoder"] = HIDES
+        along, drive = channels[0], _values(f for f in found if of_the_drive(f) and f.chance >= UNDECIDED)
+        loop = loop_channel(nominal, believed, simulation, drive, allowed, reasons, along.posterior.channel.raw)
+        channels = [sampled(Posterior(loop, len(allowed))), *channels[1:]]
+        found = _with_readings(findings(channels), kinematic, logs, channels, nominal)
+        gaps = _closed(channels, found)
+    if quiet and simulation is not None:
+        quiet = _quiet_in_the_loop(simulation, found, channels, gaps, nothing_nm)
     said = verdict(found, channels, gaps, nothing_nm, quiet)
     if (warning := below_first_pair(said.named, nominal.curve)) is not None:
         reasons["stribeck"] = warning
-    if replay is not None and runs is not None and said.word != "none":
-        loop = _loop(replay, logs, runs, gaps, nothing_nm, steps_nm)
-        said, told = _in_the_loop(said, channels, replay, loop, gaps)
+    if simulation is not None and said.named and said.word != "none":
+        open_along = any(gap.channel in ("plant", "loop") and stays(gap, HALF, floors=1.0) for gap in gaps)
+        said, told = borne_out(said, _loop(simulation, gaps, nothing_nm), open_along=open_along)
         if told is not None:
             reasons["closed_loop"] = told
             gaps = _closed(channels, said.named)
     said = _cautious(said, reasons, any(r.experiment.validation for r in logs))
-    return _told(experiments, logs, channels, gaps, said, reasons, replay, runs)
+    gaps = gaps if along is None else [*gaps, *_closed([along], said.named)]
+    return _told(experiments, logs, channels, gaps, said, reasons, simulation)
 
 
 def _closed(channels: Sequence[Sampled], named: Sequence[Finding]) -> list[Closed]:
@@ -131,11 +139,31 @@ def _channels(
     return [plant] if actuation is None else [plant, actuation]
 
 
-def _believed(experiments: ExperimentSet, replay: Replay | None) -> tuple[Recording, ...]:
+def _simulation(experiments: ExperimentSet, logs: Sequence[Recording]) -> Simulation | None:
+    """The believed joint under its controller; None where that cannot be simulated."""
+    if why_not(experiments) is not None:
+        return None
+    replay, role = Replay(experiments), _judged_role(logs)
+    bare = replay({}, validation=role)
+    return Simulation(replay, role, bare, _white_nm(logs), replay.steps_nm(bare, role))
+
+
+def _believed(experiments: ExperimentSet, simulation: Simulation | None) -> tuple[Recording, ...]:
     """The believed joint recorded as the set was: what sampling and filters make of it is no gap."""
-    if replay is None or any(e.torque_nm is None for e in experiments.experiments):
+    if simulation is None or any(e.torque_nm is None for e in experiments.experiments):
         return ()
-    return recordings(replace(experiments, experiments=replay.recorded()))
+    return recordings(replace(experiments, experiments=simulation.replay.recorded()))
+
+
+def _hides(along: Sampled, gap: Closed, simulation: Simulation) -> bool:
+    """Whether no gap shows along the motion, and noise there is much louder than that of the closed loop."""
+    noise_nm = min(along.posterior.floor, along.posterior.channel.known_floor)
+    return gap.before <= FLOORS * gap.floor and simulation.noise_nm < COARSE * noise_nm
+
+
+def _values(found: Iterable[Finding]) -> dict[str, dict[str, float]]:
+    """The numbers of those causes that have some."""
+    return {f.effect: {name: v.value for name, v in f.parameters.items()} for f in found if f.parameters}
 
 
 def _with_readings(
@@ -191,6 +219,21 @@ def _white_nm(logs: Sequence[Recording]) -> float:
     return gain * rms(np.array([white_rms(t) for r in judged if (t := r.experiment.torque_nm) is not None] or [0.0]))
 
 
+def _quiet_in_the_loop(
+    simulation: Simulation,
+    found: Sequence[Finding],
+    channels: Sequence[Sampled],
+    gaps: Sequence[Closed],
+    negligible_nm: float,
+) -> bool:
+    """Whether the simulated closed loop shows no gap, or none with what the belief may well be wrong by."""
+    quiet_nm = _quiet_nm(gaps, simulation.noise_nm, negligible_nm)
+    if settled_nm(simulation.bare) <= quiet_nm:
+        return True
+    tolerable = _tolerable(found, channels, gaps, negligible_nm)
+    return bool(tolerable) and simulation.gap_nm(tolerable) <= quiet_nm
+
+
 def _quiet_nm(gaps: Sequence[Closed], known_nm: float, negligible_nm: float) -> float:
     """The torque gap of the simulated closed loop that is no more than noise, N m.
 
@@ -214,54 +257,13 @@ def _tolerable(
     loud = [f for f in likely if f.size >= STANDS_OUT]
     if any(needed(f, channels) for f in likely) or not all(expected(f, channels, AS_STATED) for f in loud):
         return {}
-    return {f.effect: {name: v.value for name, v in f.parameters.items()} for f in likely}
+    return _values(likely)
 
 
-def _loop(
-    replay: Replay,
-    logs: Sequence[Recording],
-    bare: Mapping[str, Replayed],
-    gaps: Sequence[Closed],
-    negligible_nm: float,
-    steps_nm: float,
-) -> Loop:
+def _loop(simulation: Simulation, gaps: Sequence[Closed], negligible_nm: float) -> Loop:
     """The closed loop on the logs a gap is told of, as it judges causes."""
-    role = _judged_role(logs)
-    known_nm = math.hypot(_white_nm(logs), steps_nm)
-    noise_nm = max([known_nm, *(gap.floor for gap in gaps if gap.channel == "actuation")])
-
-    def gap_nm(effects: Effects) -> float:
-        with np.errstate(over="ignore", invalid="ignore"):
-            gap = settled_nm(replay(effects, validation=role))
-        # A joint that no controller holds is as far off as can be.
-        return gap if math.isfinite(gap) else math.inf
-
-    return Loop(gap_nm, settled_nm(bare), noise_nm, negligible_nm)
-
-
-def _in_the_loop(
-    said: Verdict, channels: Sequence[Sampled], replay: Replay, loop: Loop, gaps: Sequence[Closed]
-) -> tuple[Verdict, str | None]:
-    """The verdict as the simulated closed loop has it, and what to tell of that."""
-    told: str | None = None
-    if said.named:
-        open_along = any(gap.channel == "plant" and stays(gap, HALF, floors=1.0) for gap in gaps)
-        said, told = borne_out(said, loop, open_along=open_along)
-    plant = next((c for c in channels if c.posterior.channel.name == "plant"), None)
-    drive = [f for f in said.named if said.word == "explained" and of_the_drive(f) and f.parameters]
-    quiet = all(gap.before <= FLOORS * gap.floor for gap in gaps if gap.channel == "plant")
-    if plant is None or not quiet or (said.word != "unknown" and len(drive) < len(said.named)):
-        return said, told
-    beside = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in drive}
-    found = hidden(plant.posterior.channel.candidates, replay, loop, beside)
-    if found is None:
-        return said, told
-    named = tuple(sorted([*found[0], *drive], key=lambda f: -f.size))
-    names = " and ".join(f.effect for f in named)
-    return Verdict("ambiguous" if any(f.rivals for f in found[0]) else "explained", named), (
-        f"noise hides along the motion what the simulated torque of the validation logs shows: "
-        f"it is {loop.before_nm:.3g} N m off, {found[1]:.3g} with {names}"
-    )
+    noise_nm = max([simulation.noise_nm, *(gap.floor for gap in gaps if gap.channel == "actuation")])
+    return Loop(simulation.gap_nm, settled_nm(simulation.bare), noise_nm, negligible_nm)
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:
@@ -294,14 +296,14 @@ def _told(
     gaps: Sequence[Closed],
     said: Verdict,
     reasons: dict[str, str],
-    replay: Replay | None,
-    bare: Mapping[str, Replayed] | None,
+    simulation: Simulation | None,
 ) -> Diagnosis:
     """The result as a value."""
-    if replay is None:
+    if simulation is None:
         reasons["forward_torque_nm"] = why_not(experiments) or ""
         reasons.setdefault("forward_position_rad", reasons["forward_torque_nm"])
     effects = {f.effect: {n: v.value for n, v in f.parameters.items()} for f in said.named if f.confidence >= UNDECIDED}
+    bare, replay = (None, None) if simulation is None else (simulation.bare, simulation.replay)
     applied = said.word == "explained"
     runs: dict[str, Mapping[str, Replayed]] = {}
     if replay is not None and bare is not None:
@@ -399,7 +401,7 @@ def _next(
     first = open_ones[0]
     others = [*first.rivals, *(f.effect for f in (*open_ones[1:], *said.named) if f is not first)]
     others += [*either_way(channels), first.effect]
-    of_torque = next((c for c in channels if c.posterior.channel.name == "plant"), None)
+    of_torque = next((c for c in channels if c.posterior.channel.of_the_joint), None)
     return next_experiment(first.effect, others[0], nominal, logs, of_torque)
 
 

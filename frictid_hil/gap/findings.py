@@ -11,7 +11,7 @@ import numpy as np
 from scipy import special
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.channel import FAMILY, STIFFNESS, Term
+from frictid_hil.gap.channel import FAMILY, STIFFNESS, Channel, Term
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.plainest import CANCELS, plainest
 from frictid_hil.gap.posterior import FORM, Draw, Posterior, by_term, joined
@@ -323,12 +323,12 @@ def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
     if not found:
         return {}
     if _opposed([(term, values) for term, values in found if term.shape]):
-        return _read(effect, posterior.channel.name, *_nearest(effect, channel, found))
+        return _read(effect, posterior.channel, *_nearest(effect, channel, found))
     told, form = _between(found), all_effects()[effect].inverse
     # Between two lines over position there is none: each has coefficients of its own.
     apart = form is not None and not form.continuous and len(told.columns) > 1
     alike = [v for t, v in found if v.size == len(told.columns) and not (apart and t.shape != told.shape)]
-    return _read(effect, posterior.channel.name, told, np.sum(alike, axis=0))
+    return _read(effect, posterior.channel, told, np.sum(alike, axis=0))
 
 
 def _opposed(shaped: Sequence[tuple[Term, Array]]) -> bool:
@@ -362,11 +362,11 @@ def _between(found: Sequence[tuple[Term, Array]]) -> Term:
     return replace(loudest, shape=mean)
 
 
-def _read(effect: str, channel: str, term: Term, values: Array) -> dict[str, float]:
+def _read(effect: str, channel: Channel, term: Term, values: Array) -> dict[str, float]:
     form = all_effects()[effect]
-    if channel == "plant" and form.inverse is not None:
+    if channel.of_the_joint and form.inverse is not None:
         return form.inverse.parameters(term.shape, values)
-    if channel == "tracking":
+    if channel.name == "tracking":
         # What a late or slack position adds grows with its number; a gain is none of these.
         neutral = {link.name: link.neutral for link in form.tracking.links} if form.tracking is not None else {}
         return {n: v if neutral.get(n, 1.0) else v * float(values[0]) for n, v in term.shape.items()}

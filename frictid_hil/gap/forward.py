@@ -6,6 +6,7 @@ of the model stays a small difference of torque and does not grow into another m
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -133,16 +134,20 @@ class Replay:
         carried = any(all_effects()[name].carried for name in effects)
         return self._replayed(self.model(effects), carried, validation)
 
+    def without_steps(self) -> Replay:
+        """The same replays with an encoder that rounds nothing."""
+        other = copy.copy(self)
+        other._nominal = replace(self._nominal, encoder=replace(self._nominal.encoder, counts_per_revolution=0.0))
+        return other
+
     def steps_nm(self, bare: Mapping[str, Replayed], validation: bool | None) -> float:
         """RMS of what the encoder's steps make of the believed joint's torque, N m; ``bare`` is its replay with them.
 
         In a closed loop they decide when a joint lets go: the recording and its simulation are two draws of it.
         """
-        encoder = self._nominal.encoder
-        if encoder.counts_per_revolution == 0.0:
+        if self._nominal.encoder.counts_per_revolution == 0.0:
             return 0.0
-        exact = replace(self._nominal, encoder=replace(encoder, counts_per_revolution=0.0))
-        smooth = self._replayed(exact, False, validation)
+        smooth = self.without_steps()({}, validation=validation)
         apart = [(bare[n].torque_nm - run.torque_nm)[run.settled :] for n, run in smooth.items()]
         return rms(np.concatenate(apart))
 
@@ -188,6 +193,28 @@ class Replay:
             low_pass(experiment.position_rad - rows.position_rad),
             min(held, experiment.time_s.size // 3),
         ), rows.state
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """The believed joint of one set under its controller."""
+
+    replay: Replay
+    validation: bool | None  # role of the logs that a gap is told of, as for ``Replay``
+    bare: Mapping[str, Replayed]  # these logs less the believed joint's
+    white_nm: float  # RMS that white noise makes of that torque
+    steps_nm: float  # RMS that the encoder's steps make of it
+
+    @property
+    def noise_nm(self) -> float:
+        """RMS that both make of it."""
+        return math.hypot(self.white_nm, self.steps_nm)
+
+    def gap_nm(self, effects: Effects) -> float:
+        """RMS of the torque gap with effects added, N m; infinite where no controller holds the joint."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            gap = settled_nm(self.replay(effects, validation=self.validation))
+        return gap if math.isfinite(gap) else math.inf
 
 
 def pooled(differences: Mapping[str, Replayed], part: str) -> float:

@@ -54,15 +54,9 @@ def plant_channel(
         residuals = [left - plant_residual(b, report) for left, b in zip(residuals, believed, strict=True)]
     views, noises = quiet_views(nominal, logs)
     measured = [r.view for r in logs if r.view is not None]
-    builder = Builder([[] for _ in logs])
     friction_nm = rms(np.concatenate([v.coulomb_nm * v.slip + v.rate_nm for v in views]))
     scale = min(friction_nm / 3.0, _gap_nm(residuals, logs[0].step_s))
-    known = nuisances(nominal, views, logs, builder, estimated)
-    candidates = _causes(library, views, measured, known, scale, builder)
-    generic = families(views)
-    if sum(not r.experiment.validation for r in logs) >= SEVERAL:
-        generic[EACH_LOG] = of_each_log([np.stack([np.ones_like(v.slip), v.slip], axis=1) for v in views])
-    candidates += families_of(generic, scale, builder)
+    builder, known, candidates = terms_of(nominal, views, measured, logs, library, estimated, scale)
     low_pass = band(residuals, logs[0].step_s, candidates, builder.parts)
     rows = []
     for r, v, residual, noise, columns in zip(logs, measured, residuals, noises, builder.parts, strict=True):
@@ -70,13 +64,33 @@ def plant_channel(
         first = min(held // low_pass.stride + 1, len(range(0, residual.size, low_pass.stride)) // 3)
         rows.append(rows_of(r, columns, residual, low_pass, first=first, known_noise=noise, report=report))
     step_s, white = logs[0].step_s * low_pass.stride, white_nm(logs, low_pass)
-    rows = [_no_louder(row) for row in without_nuisances(rows, known, candidates)]
-    rows = _told(rows, white, views[0].coulomb_nm, step_s)
+    rows = [no_louder(row) for row in without_nuisances(rows, known, candidates)]
+    rows = heard(rows, white, views[0].coulomb_nm, step_s)
     raw = _raw(logs, residuals, noises)
     known_floor = math.hypot(white, rms(np.concatenate([log.known_noise[log.told] for log in rows])))
     return Channel(
         "plant", step_s, tuple(rows), tuple(known), tuple(candidates), scale, low_pass.cutoff_hz, raw, known_floor
     )
+
+
+def terms_of(
+    nominal: Nominal,
+    views: Sequence[View],  # what columns are made of
+    measured: Sequence[View],  # whose torque tells which shapes to try
+    logs: Sequence[Recording],
+    library: Collection[str],
+    estimated: Collection[str],
+    scale: float,  # what a cause may well make
+) -> tuple[Builder, list[Term], list[Term]]:
+    """(columns, nuisances, candidates): the ways in which a joint may differ along its motion."""
+    builder = Builder([[] for _ in logs])
+    known = nuisances(nominal, views, logs, builder, estimated)
+    candidates = _causes(library, views, measured, known, scale, builder)
+    generic = families(views)
+    if sum(not r.experiment.validation for r in logs) >= SEVERAL:
+        generic[EACH_LOG] = of_each_log([np.stack([np.ones_like(v.slip), v.slip], axis=1) for v in views])
+    candidates += families_of(generic, scale, builder)
+    return builder, known, candidates
 
 
 def _causes(
@@ -140,13 +154,13 @@ def white_nm(logs: Sequence[Recording], low_pass: LowPass) -> float:
     return low_pass.white_gain * rms(np.array(white))
 
 
-def _no_louder(row: Rows) -> Rows:
+def no_louder(row: Rows) -> Rows:
     """A log whose known noise is no louder than its residual: a coarse count that stands still makes none."""
     heard, known = rms(row.y), rms(row.known_noise)
     return row if known <= heard else replace(row, known_noise=row.known_noise * (heard / known))
 
 
-def _told(rows: Sequence[Rows], white_nm: float, coulomb_nm: float, step_s: float) -> list[Rows]:
+def heard(rows: Sequence[Rows], white_nm: float, coulomb_nm: float, step_s: float) -> list[Rows]:
     """The logs, those rows marked in which noise of the position is much louder than in most: of a stuck spring.
 
     A coarse encoder does not say how far a stuck joint has bent its spring, and so not which torque it asks for.

@@ -133,7 +133,7 @@ def expected(cause: Finding, channels: Sequence[Sampled], one_sigmas: float = MO
 
 def _stated(channels: Sequence[Sampled]) -> dict[str, Term]:
     """Beliefs about the joint, by the cause that an error of each is."""
-    plant = [c.posterior.channel for c in channels if c.posterior.channel.name == "plant"]
+    plant = [c.posterior.channel for c in channels if c.posterior.channel.of_the_joint]
     return {t.effect: t for channel in plant for t in channel.nuisances if t.effect and not t.shape}
 
 

@@ -188,7 +188,7 @@ def test_lines_over_position_are_read_each_by_its_own_coefficients() -> None:
     terms = [
         Term("torque_ripple", s, c, np.zeros(len(c)), np.ones(len(c))) for s, c in zip(lines, columns, strict=True)
     ]
-    posterior = SimpleNamespace(channel=SimpleNamespace(name="plant"), terms=lambda _: terms)
+    posterior = SimpleNamespace(channel=SimpleNamespace(name="plant", of_the_joint=True), terms=lambda _: terms)
     values = np.array([0.1, 0.0, 2.0, 0.0, 0.0, 1.0, 0.2, 0.0])
     draw: Any = SimpleNamespace(model=None, values=values)
     channel: Any = SimpleNamespace(posterior=posterior)
@@ -201,7 +201,7 @@ def test_lines_over_position_are_read_each_by_its_own_coefficients() -> None:
 
 def test_two_delays_that_pull_the_same_way_are_one_between_them() -> None:
     terms = [Term("torque_delay", {"delay_s": s}, (k,), np.ones(1), np.ones(1)) for k, s in enumerate((0.02, 0.04))]
-    posterior = SimpleNamespace(channel=SimpleNamespace(name="tracking"), terms=lambda _: terms)
+    posterior = SimpleNamespace(channel=SimpleNamespace(name="tracking", of_the_joint=False), terms=lambda _: terms)
     draw: Any = SimpleNamespace(model=None, values=np.array([0.5, 0.5]))
     channel: Any = SimpleNamespace(posterior=posterior)
     assert parameters("torque_delay", channel, draw) == pytest.approx({"delay_s": 0.03})

@@ -1,0 +1,70 @@
+"""The loop channel: measured torque against that of the believed joint, simulated under its known controller.
+
+A coarse encoder hides along the measured motion what its controller answers to all the same. Here nothing is read from
+a measured position. Each way in which the joint may differ is a torque along the believed motion, and its column is
+what the controller makes of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from frictid_hil.gap.channel import Channel, Rows
+from frictid_hil.gap.experiment_set import Nominal
+from frictid_hil.gap.forward import Effects, Replayed, Simulation
+from frictid_hil.gap.linear_loop import answered
+from frictid_hil.gap.plant_channel import heard, no_louder, terms_of, without_nuisances
+from frictid_hil.gap.residuals import LowPass, Recording, reported, rms
+
+
+def loop_channel(
+    nominal: Nominal,  # the believed joint
+    believed: Sequence[Recording],  # it, recorded as the set was, its encoder without steps
+    simulation: Simulation,
+    beside: Effects,  # causes of the drive, which are known to be there
+    library: Collection[str],  # effects that may be used
+    estimated: Collection[str],  # as for the plant channel
+    raw: tuple[float, float],  # of the plant channel
+) -> Channel:
+    """The channel of a set whose closed loop can be simulated."""
+    runs, smooth = simulation.replay(beside), simulation.replay.without_steps()(beside)
+    gaps = [runs[r.experiment.name] for r in believed]
+    views = [r.view for r in believed if r.view is not None]
+    # The shapes to try are chosen by what is left of the torque.
+    left = [replace(v, torque_nm=v.torque_nm + gap.torque_nm) for v, gap in zip(views, gaps, strict=True)]
+    scale = rms(np.concatenate([gap.torque_nm[gap.settled :] for gap in gaps]))
+    builder, known, candidates = terms_of(nominal, views, left, believed, library, estimated, scale)
+    low_pass = LowPass.at(1.0 / believed[0].step_s)
+    controller, report = nominal.controller, nominal.torque_report_filter
+    assert controller is not None
+    rows = []
+    for r, view, gap, blocks in zip(believed, views, gaps, builder.parts, strict=True):
+        columns = answered(np.concatenate(blocks, axis=1), view, nominal, controller)
+        table = low_pass.thinned(reported(columns, report, r.step_s))
+        steps_nm = gap.torque_nm - smooth[r.experiment.name].torque_nm
+        rows.append(no_louder(_rows(r, gap, table, steps_nm, low_pass)))
+    step_s = believed[0].step_s * low_pass.stride
+    rows = heard(without_nuisances(rows, known, candidates), simulation.white_nm, views[0].coulomb_nm, step_s)
+    return Channel(
+        "loop",
+        step_s,
+        tuple(rows),
+        tuple(known),
+        tuple(candidates),
+        scale,
+        low_pass.cutoff_hz,
+        raw,
+        known_floor=simulation.noise_nm,
+    )
+
+
+def _rows(r: Recording, gap: Replayed, table: np.ndarray, steps_nm: np.ndarray, low_pass: LowPass) -> Rows:
+    """One log from where it has settled; its difference has passed the low-pass already."""
+    first, stride = gap.settled // low_pass.stride + 1, low_pass.stride
+    x = table[first:-2]
+    y, noise = (column[::stride][first : first + x.shape[0]] for column in (gap.torque_nm, steps_nm))
+    told = np.ones(y.size, dtype=bool)
+    return Rows(r.experiment.name, r.experiment.validation, first * stride * r.step_s, y, x, noise, told)
