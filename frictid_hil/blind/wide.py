@@ -473,25 +473,51 @@ def asked(c: Controller, command: Array, position: Array, start_nm: float) -> Ar
 
 
 def _floors(setting: Setting, base: Sequence[Run]) -> dict[str, float] | None:
-    """What torque noise and the encoder's steps leave of each channel behind the low-pass, N m; None as above.
+    """What noise and the encoder's steps leave of each channel in the rows of the logs, N m; None as above.
 
-    A closed loop that nobody can simulate is no channel.
+    Rows that are fewer than control ticks fold the jumps of a torque, which every step makes, into what the low-pass
+    lets through; the best answer leaves them there. A closed loop that nobody can simulate is no channel.
     """
-    rate, step = 1.0 / setting.step_s, setting.physics.encoder_step
-    noise = rms(low_pass(_noise(np.random.default_rng(1), setting, 20_000), rate))
-    read = [(q[:: setting.thin], motion) for (q, _, _), motion in zip(base, setting.motions, strict=True)]
-    shaken = [
-        _asked_nm(setting, np.round(q / step) * step, m, setting.step_s) - _asked_nm(setting, q, m, setting.step_s)
-        for q, m in read
-    ]
-    floors = {"inverse": math.hypot(noise, rms(np.concatenate([low_pass(part, rate) for part in shaken])))}
-    if setting.controller == "unknown":
-        return floors
+    noise = rms(low_pass(_noise(np.random.default_rng(1), setting, 20_000), 1.0 / setting.step_s))
     stepped = _runs(setting, setting.physics, setting.control, steps=1.0)
     if stepped is None:
         return None
-    apart = [low_pass(t - t0, 1.0 / setting.control.tick) for (_, t, _), (_, t0, _) in zip(stepped, base, strict=True)]
-    return {**floors, "torque": math.hypot(noise, rms(np.concatenate(apart))), "actuation": noise}
+    coarse, fine = _in_rows(setting, stepped), _in_rows(setting, base)
+    return {
+        channel: math.hypot(
+            noise, rms(np.concatenate([c - f for c, f in zip(coarse[channel], fine[channel], strict=True)]))
+        )
+        for channel in coarse
+    }
+
+
+def _in_rows(setting: Setting, runs: Sequence[Run]) -> dict[str, list[Array]]:
+    """What each channel shows of the rows that a log keeps, by motion, low-passed."""
+    tick, thin, step_s = setting.control.tick, setting.thin, setting.step_s
+    shown: dict[str, list[Array]] = {"inverse": []}
+    if setting.controller != "unknown":
+        shown |= {"torque": [], "actuation": []}
+    for (q, torque, _), motion in zip(runs, setting.motions, strict=True):
+        kept, read = q[::thin], _reported(setting, torque, tick)[::thin]
+        centred = read + 0.5 / thin * np.diff(read, append=read[-1])
+        along = _reported(setting, _asked_nm(setting, kept, motion, step_s), step_s)
+        shown["inverse"].append(low_pass(centred - along, 1.0 / step_s)[round(BEGUN_S / step_s) :])
+        if setting.controller == "unknown":
+            continue
+        shown["torque"].append(low_pass(read, 1.0 / step_s))
+        ticks = np.arange(q.size)
+        between = np.interp(ticks, ticks[::thin], kept)
+        demand = _reported(setting, asked(setting.control, motion.command, between, float(torque[0])), tick)
+        late = read - np.concatenate([demand[:1], demand[:-1]])[::thin]
+        shown["actuation"].append(low_pass(late - np.median(late[: round(0.5 / step_s)]), 1.0 / step_s))
+    return shown
+
+
+def _reported(setting: Setting, torque: Array, step_s: float) -> Array:
+    """As the drive's own filter lets it through."""
+    for _ in range(setting.filter_order):
+        torque = torque[0] + lagging(torque - torque[0], step_s, setting.filter_s)
+    return torque
 
 
 def _pairs(setting: Setting) -> tuple[list[float], list[float]]:
@@ -601,8 +627,7 @@ def _recorded(rng: np.random.Generator, setting: Setting, physics: Physics, cont
         n = motion.command.size
         position, velocity, torque, heat = plant.run(motion.command, control, mounted, heat, clock, rng.random(n))
         clock += n * control.tick
-        for _ in range(setting.filter_order):
-            torque = torque[0] + lagging(torque - torque[0], control.tick, setting.filter_s)
+        torque = _reported(setting, torque, control.tick)
         ticks = control.tick * np.arange(n)
         times = ticks[:: setting.thin]
         if setting.jitter > 0.0:
