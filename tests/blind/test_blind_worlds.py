@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from frictid_hil.blind import judged, plant, spoilt, wide, zoo
+from frictid_hil.blind.figures import low_pass, rms
 from frictid_hil.blind.worlds import WORLDS, write_rows
 from frictid_hil.errors import UsageError
 from frictid_hil.gap.experiment_set import ExperimentSet
@@ -65,6 +66,33 @@ def test_a_softer_presliding_shows_along_the_motion_and_hardly_in_the_loop() -> 
     assert sizes is not None and sizes["inverse"] > 3.0 * sizes["torque"]
     # Where nobody knows the controller, nobody can simulate its loop.
     assert set(wide._floors(replace(setting, controller="unknown"), base) or {}) == {"inverse"}
+
+
+@pytest.mark.slow
+def test_floors_are_what_the_rows_of_a_log_show_of_a_joint_that_is_as_believed() -> None:
+    made = (wide._setting(np.random.default_rng([5, n])) for n in range(200))
+    wanted = (s for s in made if s.controller == "known" and s.thin == 5 and not s.filter_order and not s.gaps)
+    setting = next(s for s in wanted if s.jitter == 0.0 and s.size in ("hobby", "direct"))
+    base = wide._runs(setting, setting.physics, setting.control)
+    assert base is not None
+    floors = wide._floors(setting, base)
+    assert floors is not None
+    demanded, simulated, tick = [], [], setting.control.tick
+    recorded = wide._recorded(np.random.default_rng(0), setting, setting.physics, setting.control)
+    for row, motion, (_, torque, _) in zip(recorded, setting.motions, base, strict=True):
+        # A controller that is replayed between the rows, and the torque of a joint whose encoder has no steps.
+        n = motion.command.size
+        q = np.interp(tick * np.arange(n), row.columns["time_s"], row.columns["position_rad"])
+        demand = wide.asked(setting.control, motion.command, q, float(row.columns["torque_nm"][0]))
+        asked_nm = np.concatenate([demand[:1], demand[:-1]])[:: setting.thin]
+        late = row.columns["torque_nm"] - asked_nm
+        demanded.append(low_pass(late - np.median(late[: round(0.5 / setting.step_s)]), 1.0 / setting.step_s))
+        simulated.append(low_pass(row.columns["torque_nm"] - torque[:: setting.thin], 1.0 / setting.step_s))
+    assert 0.7 < rms(np.concatenate(demanded)) / floors["actuation"] < 1.4
+    assert 0.7 < rms(np.concatenate(simulated)) / floors["torque"] < 1.4
+    assert floors["torque"] > 1.5 * rms(
+        low_pass(wide._noise(np.random.default_rng(1), setting, 20_000), 1.0 / setting.step_s)
+    )
 
 
 @pytest.mark.slow

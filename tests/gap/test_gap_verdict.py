@@ -22,7 +22,14 @@ def channel(name: str, cause: str, size: float, signs: np.ndarray, *, between_ro
     """Draws that all hold one cause of a size, in floors, with the signs of its coefficient."""
     term = Term(cause, {}, (0,), np.zeros(1), np.ones(1))
     nuisances = (term,) if cause == ERROR else ()
-    held = SimpleNamespace(name=name, nuisances=nuisances, between_rows=between_rows, logs=(), level_free=False)
+    held = SimpleNamespace(
+        name=name,
+        nuisances=nuisances,
+        between_rows=between_rows,
+        logs=(),
+        level_free=False,
+        of_the_joint=name in ("plant", "loop"),
+    )
     posterior: Any = SimpleNamespace(
         channel=held,
         chance=0.03,
