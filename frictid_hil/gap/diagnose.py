@@ -47,6 +47,7 @@ from frictid_hil.gap.verdict import (
     expected,
     needed,
     stays,
+    swings,
     verdict,
 )
 from frictid_hil.gap.where import lives, where
@@ -90,7 +91,9 @@ def diagnose(
     nothing_nm = _negligible(nominal, channels, negligible)
     quiet = _raw_quiet(channels, negligible)
     along = None
-    if simulation is not None and believed and _hides(channels[0], gaps[0], simulation):
+    # A link that swings by itself is no small change of the loop: where it shows along the motion, it is read there.
+    swinging = any(swings(f.effect) and f.chance >= UNDECIDED for f in found)
+    if simulation is not None and believed and not swinging and _hides(channels[0], gaps[0], simulation):
         reasons["encoder"] = HIDES
         along, drive = channels[0], _values(f for f in found if of_the_drive(f) and f.chance >= UNDECIDED)
         loop = loop_channel(nominal, believed, simulation, drive, allowed, reasons, along.posterior.channel.raw)
