@@ -90,13 +90,13 @@ def diagnose(
     gaps = _closed(channels, found)
     nothing_nm = _negligible(nominal, channels, negligible)
     quiet = _raw_quiet(channels, negligible)
-    along = None
-    # A link that swings by itself is no small change of the loop: where it shows along the motion, it is read there.
-    swinging = any(swings(f.effect) and f.chance >= UNDECIDED for f in found)
-    if simulation is not None and believed and not swinging and _hides(channels[0], gaps[0], simulation):
-        reasons["encoder"] = HIDES
-        along, drive = channels[0], _values(f for f in found if of_the_drive(f) and f.chance >= UNDECIDED)
-        loop = loop_channel(nominal, believed, simulation, drive, allowed, reasons, along.posterior.channel.raw)
+    along = loop = None
+    if simulation is not None and believed and _hides(channels[0], gaps[0], found, simulation):
+        drive = _values(f for f in found if of_the_drive(f) and f.chance >= UNDECIDED)
+        raw = channels[0].posterior.channel.raw
+        loop = loop_channel(nominal, believed, simulation, drive, allowed, reasons, raw)
+    if loop is not None:
+        reasons["encoder"], along = HIDES, channels[0]
         channels = [sampled(Posterior(loop, len(allowed))), *channels[1:]]
         found = _with_readings(findings(channels), kinematic, logs, channels, nominal)
         gaps = _closed(channels, found)
@@ -158,8 +158,13 @@ def _believed(experiments: ExperimentSet, simulation: Simulation | None) -> tupl
     return recordings(replace(experiments, experiments=simulation.replay.recorded()))
 
 
-def _hides(along: Sampled, gap: Closed, simulation: Simulation) -> bool:
-    """Whether no gap shows along the motion, and noise there is much louder than that of the closed loop."""
+def _hides(along: Sampled, gap: Closed, found: Sequence[Finding], simulation: Simulation) -> bool:
+    """Whether no gap shows along the motion, and noise there is much louder than that of the closed loop.
+
+    A link that swings by itself is no small change of the loop: where it shows along the motion, it is read there.
+    """
+    if any(swings(f.effect) and f.chance >= UNDECIDED for f in found):
+        return False
     noise_nm = min(along.posterior.floor, along.posterior.channel.known_floor)
     return gap.before <= FLOORS * gap.floor and simulation.noise_nm < COARSE * noise_nm
 

@@ -38,7 +38,7 @@ def answered(asked_nm: Array, view: View, nominal: Nominal, controller: Controll
 
 
 def _rates(view: View, nominal: Nominal, controller: Controller) -> Array:
-    """Of change of all states, per second, about each row, shape (n, 6, 6)."""
+    """Change of each state per second and unit of every other, about each row, shape (n, 6, 6)."""
     inertia = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2 + view.payload_inertia_kg_m2
     stuck, forgets_per_s = _bristle(view)
     seen_s = controller.velocity_filter_s + 0.5 / controller.rate_hz

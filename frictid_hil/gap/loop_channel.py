@@ -28,9 +28,12 @@ def loop_channel(
     library: Collection[str],  # effects that may be used
     estimated: Collection[str],  # as for the plant channel
     raw: tuple[float, float],  # of the plant channel
-) -> Channel:
-    """The channel of a set whose closed loop can be simulated."""
-    runs, smooth = simulation.replay(beside), simulation.replay.without_steps()(beside)
+) -> Channel | None:
+    """The channel of a set whose closed loop can be simulated; None where it runs away with what is beside."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        runs, smooth = simulation.replay(beside), simulation.replay.without_steps()(beside)
+    if not all(np.all(np.isfinite(run.torque_nm)) for run in (*runs.values(), *smooth.values())):
+        return None
     gaps = [runs[r.experiment.name] for r in believed]
     views = [r.view for r in believed if r.view is not None]
     # The shapes to try are chosen by what is left of the torque.

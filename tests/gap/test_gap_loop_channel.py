@@ -12,8 +12,9 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnose import HIDES, diagnose
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import Nominal
-from frictid_hil.gap.forward import Effects, Replay
+from frictid_hil.gap.forward import Effects, Replay, Simulation
 from frictid_hil.gap.linear_loop import answered
+from frictid_hil.gap.loop_channel import loop_channel
 from frictid_hil.gap.residuals import LowPass, recordings, rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -113,3 +114,16 @@ def test_what_no_effect_names_is_unknown_behind_a_coarse_encoder_too() -> None:
         library=["friction_level_error", "viscous_error", "inertia_error"],
     )
     assert left_out.verdict == "unknown"
+
+
+def test_a_loop_that_runs_away_is_no_channel(monkeypatch: pytest.MonkeyPatch) -> None:
+    experiments = gap_sets.make(nominal=COARSE, only=QUICK)
+    replay = Replay(experiments)
+    simulation = Simulation(replay, True, replay({}, validation=True), 0.01, 0.01)
+    believed = recordings(replace(experiments, experiments=replay.recorded()))
+    stays = loop_channel(experiments.nominal, believed, simulation, {}, (), (), (0.0, 0.0))
+    assert stays is not None and stays.name == "loop"
+    runs = replay({})
+    away = {name: replace(run, torque_nm=np.full_like(run.torque_nm, np.nan)) for name, run in runs.items()}
+    monkeypatch.setattr(Replay, "__call__", lambda *_, **__: away)
+    assert loop_channel(experiments.nominal, believed, simulation, {}, (), (), (0.0, 0.0)) is None
