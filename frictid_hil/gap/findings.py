@@ -59,7 +59,7 @@ class Sampled:
     draws: Sequence[Draw]  # samples
     # By cause, its size over the floor in every draw less what others take back, (draws,); 0 if not in.
     sizes: Mapping[str, Array]
-    # By cause, the sign of its coefficient, (draws,); 1 where it has several columns and so no sides.
+    # By cause, the sign of its coefficient, (draws,); 1 where it is no error of one believed number, and has no sides.
     signs: Mapping[str, Array]
     # By cause, one-sigma of what the forms of the others may have put on it, in the same unit.
     blurs: Mapping[str, Array]
@@ -80,6 +80,7 @@ def sampled(posterior: Posterior) -> Sampled:
     made = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(5))
     sizes, signs, blurs, believed, tolerated = made
     expected = 1.0 / math.sqrt(_ways(posterior, gram))
+    sided = {term.effect for term in posterior.channel.nuisances if len(term.columns) == 1}
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
 
     def size_of(parts: Sequence[tuple[np.ndarray, Array]]) -> float:
@@ -96,7 +97,7 @@ def sampled(posterior: Posterior) -> Sampled:
         unnamed = [parts[""]] if "" in parts else []
         for effect, net, blur in zip(causes, *_net([*causes.values(), *unnamed], gram), strict=False):
             sizes[effect][k] = net / posterior.floor
-            signs[effect][k] = _sign(*causes[effect])
+            signs[effect][k] = np.sign(np.sum(causes[effect][1])) if effect in sided else 1.0
             blurs[effect][k] = blur / posterior.floor
         for effect, (within, whole) in posterior.believed(draw, np.diag(gram)).items():
             tolerated[effect][k] = math.sqrt(within) / posterior.floor
@@ -105,10 +106,6 @@ def sampled(posterior: Posterior) -> Sampled:
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
     lent = {effect: expected * blur for effect, blur in blurs.items()}
     return Sampled(posterior, draws, sizes, signs, blurs, lent, believed, tolerated, generic, explained, gram)
-
-
-def _sign(columns: np.ndarray, values: Array) -> float:
-    return float(np.sign(np.sum(values))) if np.all(columns == columns[0]) else 1.0
 
 
 def _ways(posterior: Posterior, gram: Array) -> float:

@@ -19,6 +19,7 @@ FREE = 10.0  # one-sigma of a share that was fitted to these very logs: nothing 
 SAME_RATE = 0.05  # rows and control ticks are the same where their rates differ by no more than this share
 ANYWHERE = 0.3  # one-sigma of a moment that is known to lie in a row, over the row: evenly spread, 1/sqrt(12)
 STIFFER = 0.1  # step of the presliding stiffness by which its derivative is formed
+ROUNDING = 1e-9  # share of a level that rounding may leave of it
 _ESTIMATED = {
     "inertia_error": "inertia",
     "gravity_error": "inertia",
@@ -113,17 +114,31 @@ def _friction_shape(nominal: Nominal, views: Sequence[View], builder: Builder) -
         bent = [v.coulomb_nm / v.stiffness_nm_per_rad * np.gradient(v.slip, v.step_s)[:, None] for v in views]
         terms.append(_term("", builder.add(bent), math.sqrt(stiffness * nominal.inertia_kg_m2)))
     bend_nm = _unmeasured_nm(nominal)
-    if bend_nm > 0.0 and nominal.curve is not None:
-        first = nominal.curve.measured_range_rad_s[0]
-        below: list[Array] = [
-            (bend_nm * v.slip * np.maximum(0.0, 1.0 - np.abs(v.velocity_rad_s) / first))[:, None] for v in views
-        ]
-        terms.append(_term("", builder.add(below), 1.0))
+    if bend_nm != 0.0:
+        terms.append(
+            _term("", builder.add([(v.slip * bend_nm - _above(nominal, v, bend_nm))[:, None] for v in views]), 1.0)
+        )
     return terms
 
 
+def bent_rate_nm(nominal: Nominal, views: Sequence[View]) -> list[Array]:
+    """phi_0(v) of a curve that goes on bending below its first pair, (n, 1) each; empty where it is straight.
+
+    Where it is bent, friction as it depends on speed begins at another level than a line through the pairs tells.
+    """
+    bend_nm = _unmeasured_nm(nominal)
+    return [(v.rate_nm - _above(nominal, v, bend_nm))[:, None] for v in views] if bend_nm != 0.0 else []
+
+
+def _above(nominal: Nominal, view: View, bend_nm: float) -> Array:
+    """A level that builds up to the first pair of the curve, (n,)."""
+    assert nominal.curve is not None
+    share: Array = np.minimum(1.0, np.abs(view.velocity_rad_s) / nominal.curve.measured_range_rad_s[0])
+    return bend_nm * view.slip * share
+
+
 def _unmeasured_nm(nominal: Nominal) -> float:
-    """What the curve below its first pair may be off by, N m: a line through the pairs against a parabola in sqrt(v).
+    """Level of the curve at rest by a parabola in sqrt(v) through its first pairs, less that by a line, N m.
 
     No friction was measured there, and the two are the straightest and the most bent curve that friction commonly has.
     """
@@ -132,4 +147,5 @@ def _unmeasured_nm(nominal: Nominal) -> float:
         return 0.0
     speed, torque = np.array(curve.velocity_rad_s[:3]), np.array(curve.torque_nm[:3])
     bent = np.polynomial.polynomial.polyfit(np.sqrt(speed), torque, 2)[0]
-    return min(abs(float(bent) - curve.coulomb_nm), curve.coulomb_nm / 3.0)
+    off, most = float(bent) - curve.coulomb_nm, curve.coulomb_nm / 3.0
+    return min(max(off, -most), most) if abs(off) > ROUNDING * most else 0.0

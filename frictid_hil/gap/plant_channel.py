@@ -14,7 +14,7 @@ from frictid_hil.gap.channel import FAMILY, STIFFNESS, Builder, Channel, Rows, T
 from frictid_hil.gap.experiment_set import Nominal
 from frictid_hil.gap.generic import WHOLE, families
 from frictid_hil.gap.noise import LOCAL_S
-from frictid_hil.gap.nuisances import nuisances
+from frictid_hil.gap.nuisances import bent_rate_nm, nuisances
 from frictid_hil.gap.position_noise import differenced_rms, quiet_views, white_rms
 from frictid_hil.gap.residuals import LowPass, Recording, first_slide, reported, rms
 from frictid_hil.simulation.effect import Region
@@ -25,6 +25,7 @@ BEYOND = 6.0
 """One-sigma of a belief that is plainly wrong, over its tolerance, at least: then the tolerance says little more."""
 SIZES = (0.1, 0.3, 1.0)  # sizes of a generic function, over what a cause may well make: half decades
 BANDS_HZ = (20.0, 40.0, 80.0, 160.0)  # cut-offs to choose from
+BENT = "bent"  # shape of an error of what depends on speed, where the curve bends below its first pair
 EACH_LOG = "each log"  # family of what differs from log to log, and says nothing of a further one
 SEVERAL = 3  # logs from which on what is of one log alone can be told from what is of all
 SWAMPED = 3.0
@@ -86,6 +87,10 @@ def terms_of(
     builder = Builder([[] for _ in logs])
     known = nuisances(nominal, views, logs, builder, estimated)
     candidates = _causes(library, views, measured, known, scale, builder)
+    if bent_nm := bent_rate_nm(nominal, views):
+        numbers = builder.add(bent_nm)
+        errors = [t for t in candidates if t.effect == "viscous_error"]
+        candidates += [replace(t, shape={BENT: 1.0}, columns=numbers) for t in errors]
     generic = families(views)
     if sum(not r.experiment.validation for r in logs) >= SEVERAL:
         generic[EACH_LOG] = of_each_log([np.stack([np.ones_like(v.slip), v.slip], axis=1) for v in views])
