@@ -130,9 +130,10 @@ class Physics(NamedTuple):
 
 
 class Controller(NamedTuple):
-    """The digital position controller: kp (b cmd - q) + integral(ki e) + kd (c d cmd/dt - filtered v) + a d2 cmd/dt2.
+    """The digital position controller: kp e + kd w + integral(ki e + inner w) + a d2 cmd/dt2.
 
-    Frozen while limited. ``backward``: it knows only the set-points that have come.
+    w = c d cmd/dt - filtered v; ``inner`` is 0 but in a cascade. The integral is frozen while the demand is limited.
+    ``backward``: it knows only the set-points that have come.
     """
 
     kp: float
@@ -142,7 +143,7 @@ class Controller(NamedTuple):
     torque_limit: float
     tick: float = TICK_S
     substeps: int = SUBSTEPS
-    command_weight: float = 1.0
+    inner: float = 0.0
     rate_weight: float = 1.0
     inertia_ahead: float = 0.0
     backward: bool = False
@@ -319,7 +320,7 @@ def run(
     state[HEAT] = heat
     network, soft = np.zeros(_NETWORK_REACH.size), np.zeros(_SOFT_REACH.size)
     law = np.zeros(4)
-    law[INTEGRAL] = first - control.kp * (control.command_weight - 1.0) * command[0]
+    law[INTEGRAL] = first
     lag_blend = 1.0 - math.exp(-h / p.lag) if p.lag > 0.0 else 1.0
     second_blend = 1.0 - math.exp(-h / p.second_lag) if p.second_lag > 0.0 else 1.0
     half_step = 0.5 * p.encoder_step
@@ -390,11 +391,11 @@ def _demanded(control: Controller, law: Array, command: Array, k: int, count: fl
     bend = (command[after] - 2.0 * command[k] + command[before]) / (period * period)
     law[FILTERED] += (1.0 - math.exp(-period / control.velocity_filter)) * (estimate - law[FILTERED])
     error = command[k] - count
-    demand = control.kp * error + law[INTEGRAL] + control.kd * (control.rate_weight * rate - law[FILTERED])
-    demand += control.kp * (control.command_weight - 1.0) * command[k] + control.inertia_ahead * bend
+    slow = control.rate_weight * rate - law[FILTERED]
+    demand = control.kp * error + law[INTEGRAL] + control.kd * slow + control.inertia_ahead * bend
     limited: float = min(max(demand, -control.torque_limit), control.torque_limit)
     if limited == demand:
-        law[INTEGRAL] += control.ki * error * period
+        law[INTEGRAL] += (control.ki * error + control.inner * slow) * period
     return limited
 
 

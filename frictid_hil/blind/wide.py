@@ -261,8 +261,7 @@ def _control(
     plain = plain._replace(backward=bool(rng.random() < 0.5))
     if law == "cascade":
         outer, pull = kp / kd, kd * rng.uniform(1.5, 4.0)
-        kp = kd * outer + pull
-        control = plain._replace(kp=kp, ki=pull * outer, command_weight=kd * outer / kp, rate_weight=0.0)
+        control = plain._replace(kp=kd * outer, ki=pull * outer, inner=pull, rate_weight=0.0)
         return control, {"kp": outer, "kv": kd, "ki": pull}
     if law == "pid_feedforward":
         return plain._replace(inertia_ahead=inertia * rng.uniform(0.6, 1.0)), {}
@@ -357,13 +356,15 @@ def _share(name: str, e: float, role: str = "tolerance") -> Contributor:
 
 
 def _gains(setting: Setting, gains: Sequence[float], role: str = "tolerance") -> Contributor:
-    named = {f"{n}_error_share": g - 1 for n, g in zip(("kp", "ki", "kd"), gains, strict=True)}
-    return Contributor(
-        "controller_gain_error",
-        role,
-        named if setting.law != "cascade" else {},
-        lambda p, c: (p, c._replace(kp=c.kp * gains[0], ki=c.ki * gains[1], kd=c.kd * gains[2])),
-    )
+    """The law's own numbers are so many times what is stated: kp, ki, kd; of a cascade kp, ki, kv."""
+    first, second, third = gains
+    kp, ki = (first * third, first * second) if setting.law == "cascade" else (first, second)
+    shares = {"kp_error_share": kp - 1, "ki_error_share": ki - 1, "kd_error_share": third - 1}
+
+    def true(p: Physics, c: Controller) -> Changed:
+        return p, c._replace(kp=c.kp * kp, ki=c.ki * ki, kd=c.kd * third, inner=c.inner * second)
+
+    return Contributor("controller_gain_error", role, shares, true)
 
 
 def _scaling(factors: dict[str, float]) -> Callable[[Physics, Controller], Changed]:
@@ -465,9 +466,9 @@ def asked(c: Controller, command: Array, position: Array, start_nm: float) -> Ar
     rate = np.diff(command, prepend=command[0]) / c.tick if c.backward else np.gradient(command, c.tick)
     bend = np.gradient(np.gradient(command, c.tick), c.tick)
     error = command - position
-    total = np.concatenate([[0.0], np.cumsum(c.ki * error * c.tick)[:-1]])
-    demand: Array = c.kp * (c.command_weight * command - position) + total + c.inertia_ahead * bend
-    demand = demand + c.kd * (c.rate_weight * rate - filtered)
+    slow = c.rate_weight * rate - filtered
+    total = np.concatenate([[0.0], np.cumsum((c.ki * error + c.inner * slow) * c.tick)[:-1]])
+    demand: Array = c.kp * error + c.kd * slow + total + c.inertia_ahead * bend
     demand += start_nm - demand[0]
     return demand
 

@@ -131,6 +131,8 @@ class ControllerFile(Open):
                 raise ValueError(f"{name}: missing in a controller of type {self.type}{hint}")
         if self.type == "cascade" and self.kd is not None:
             raise ValueError("a cascade has kp, kv and perhaps ki; kd belongs to type: pid")
+        if self.type == "cascade" and self.ki and not (self.kp and self.kv):
+            raise ValueError("ki: the integral of a cascade's inner loop needs a kp and a kv above 0")
         return self
 
 

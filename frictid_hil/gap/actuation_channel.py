@@ -12,7 +12,7 @@ from frictid_hil.config.nominal import ReportFilter
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Builder, Channel, Term, of_each_log, rows_of
 from frictid_hil.gap.command_timing import FASTEST, between_rows
-from frictid_hil.gap.experiment_set import Controller, Nominal
+from frictid_hil.gap.experiment_set import GAINS, Controller, Nominal, with_gains
 from frictid_hil.gap.plant_channel import BEYOND, families_of, white_nm, without_nuisances
 from frictid_hil.gap.residuals import (
     LowPass,
@@ -33,6 +33,9 @@ SLOWEST = 10
 """Control ticks to a row of the log up to which what the controller did between two rows can be told from them."""
 WITHIN_ROWS = 0.3
 """One-sigma of when a command took effect and a velocity was taken, in rows of a log slower than its controller."""
+LIMITED = 0.99  # share of the torque limit from which a demand is limited
+ROUNDS = 3  # times that errors of gains are fitted where the demand is not linear in them
+PLAUSIBLE = (-0.9, 4.0)  # errors of a gain that are sought
 NEAREST = (1.0 / math.sqrt(2.0), math.sqrt(2.0))
 """Coefficients of a time: values to try at most double, so that the nearest one is no further from the true one."""
 
@@ -87,7 +90,8 @@ def actuation_channel(
     drives = [_Drive.of(r, nominal, limit_nm) for r in logs]
     base = [drive.torque(nominal.believed_effects) for drive in drives]
     residuals = _residuals(nominal, logs, base, limit_nm, believed)
-    views = [_view(r, controller, limit_nm) for r in logs]
+    shares = _shares(controller, logs, base, residuals).tolist()
+    views = [_view(r, controller, limit_nm, shares) for r in logs]
     builder = Builder([[] for _ in logs])
     nuisances, candidates = _gains(nominal, views, builder, library)
     nuisances += _timing(nominal, base, logs, builder)
@@ -122,13 +126,38 @@ def actuation_channel(
     )
 
 
-def _view(recording: Recording, controller: Controller | None, limit_nm: float) -> DriveView:
+def _view(recording: Recording, controller: Controller | None, limit_nm: float, shares: Sequence[float]) -> DriveView:
     e = recording.experiment
     assert e.torque_nm is not None and recording.demand_nm is not None
     parts: Array = np.empty((0, 3))
-    if controller is not None and e.position_command_rad is not None:
-        parts = demand_parts(controller, e.position_rad, e.position_command_rad, recording.step_s)
+    if controller is not None and e.torque_demand_nm is None:
+        parts = demand_parts(controller, e, recording.step_s, shares)
     return DriveView(recording.step_s, limit_nm, recording.demand_nm, e.torque_nm, parts)
+
+
+def _shares(
+    controller: Controller | None, logs: Sequence[Recording], base: Sequence[Array], residuals: Sequence[Array]
+) -> Array:
+    """Errors of the three gains by least squares, where the demand is not linear in them; else 0."""
+    shares: Array = np.zeros(len(GAINS))
+    if controller is None or any(r.experiment.torque_demand_nm is not None for r in logs):
+        return shares
+    limited = any(float(np.max(np.abs(b))) >= LIMITED * controller.torque_limit_nm for b in base)
+    if not (limited or controller.cascade):
+        return shares
+    fitted = [(r, y) for r, y in zip(logs, residuals, strict=True) if not r.experiment.validation]
+    for _ in range(ROUNDS):
+        there = with_gains(controller, shares.tolist())
+        tables, rests = [], []
+        for r, residual in fitted:
+            made = demand_parts(controller, r.experiment, r.step_s, shares.tolist()) @ shares
+            table = demand_parts(there, r.experiment, r.step_s, [0.0] * len(GAINS)) / (1.0 + shares)
+            rest = residual[1:] - made[:-1]
+            tables.append((table - np.mean(table, axis=0))[:-1])
+            rests.append(rest - np.mean(rest))
+        shares = shares + np.linalg.lstsq(np.concatenate(tables), np.concatenate(rests), rcond=None)[0]
+        shares = np.clip(shares, *PLAUSIBLE)
+    return shares
 
 
 def _gains(

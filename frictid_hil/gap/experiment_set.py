@@ -35,12 +35,16 @@ LEAST_PIECE_ROWS = 200  # shorter pieces between gaps are left out
 LOG_COLUMNS = ("time_s", *Samples.COLUMNS[:4], "rigid_body_torque_nm", "temperature_c", "torque_demand_nm")
 
 
+GAINS = ("kp_nm_per_rad", "ki_nm_per_rad_s", "kd_nm_s_per_rad")
+
+
 @dataclass(frozen=True, slots=True)
 class Controller:
     """The digital position loop, joint side.
 
-    ``kp*(b*command - q) + integral(ki*(command - q)) + kd*(c*dcommand/dt - filtered velocity) + feedforward``. A PID
-    has b = c = 1; a cascade kv (kp e - v), with or without an integral, is the same law with other weights.
+    ``kp*e + integral(ki*e) + kd*(c*dcommand/dt - filtered velocity) + feedforward`` with ``e = command - q``, c = 1 in
+    a PID. A cascade ``kv*w + integral(ki*w)`` with ``w = kp*e + c*dcommand/dt - filtered velocity`` is the same law
+    with gains kv*kp, ki*kp and kv, but that its integral takes ``inner_nm_per_rad`` times the velocity error as well.
     """
 
     rate_hz: float  # control rate
@@ -51,19 +55,30 @@ class Controller:
     torque_limit_nm: float = float("inf")  # limit of the demand
     # How dcommand/dt is formed, ``central`` or ``backward`` (a drive that follows set-points as they come).
     command_rate: str = "central"
-    command_weight: float = 1.0  # b
     command_rate_weight: float = 1.0  # c
+    cascade: bool = False  # an inner loop has an integral
     feedforward: config.FeedForward | None = None  # None where there is none
 
+    @property
+    def inner_nm_per_rad(self) -> float:
+        """Integral gain of the inner loop's error; 0 where there is no such loop."""
+        return self.ki_nm_per_rad_s * self.kd_nm_s_per_rad / self.kp_nm_per_rad if self.cascade else 0.0
+
     def added_nm(self, command_rad: Array, step_s: float) -> Array:
-        """What the law adds to a plain PID because of its command's weight and its feed-forward, shape (n,)."""
-        added: Array = (self.command_weight - 1.0) * self.kp_nm_per_rad * command_rad
+        """What the law adds to the torque by feed-forward, shape (n,)."""
+        added: Array = np.zeros_like(command_rad)
         if (feed := self.feedforward) is not None:
             velocity = np.gradient(command_rad, step_s)
             added = added + feed.inertia_kg_m2 * np.gradient(velocity, step_s)
             added = added + feed.gravity_cos_nm * np.cos(command_rad) + feed.gravity_sin_nm * np.sin(command_rad)
             added = added + feed.coulomb_nm * np.sign(velocity) + feed.viscous_nm_s_per_rad * velocity
         return added
+
+
+def with_gains(controller: Controller, shares: Sequence[float]) -> Controller:
+    """The controller with kp, ki and kd larger by these shares."""
+    changed = zip(GAINS, shares, strict=True)
+    return replace(controller, **{name: getattr(controller, name) * (1.0 + share) for name, share in changed})
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,11 +253,7 @@ def _nominal(file: NominalFile, document: Mapping[str, Any], where: str) -> Nomi
 
 
 def _controller(told: config.ControllerFile) -> Controller | None:
-    """The law as one form; None where it is unknown or only its demand is recorded.
-
-    ``kv*w + integral(ki*w)`` of a cascade, ``w = kp*e + c*dcommand/dt - v``, is ``(kv*kp + ki)*(b*command - q) +
-    integral(ki*kp*e) + kv*(c*dcommand/dt - v)`` but for a constant, as the integral of v is q; b follows.
-    """
+    """The law as one form; None where it is unknown or only its demand is recorded."""
     if told.type in ("columns", "unknown") or told.rate_hz is None or told.kp is None:
         return None
     ki = told.ki or 0.0
@@ -258,15 +269,13 @@ def _controller(told: config.ControllerFile) -> Controller | None:
     )
     if told.type == "pid" or told.kv is None:
         return plain
-    kp = told.kv * told.kp + ki
-    command_nm = told.kv * told.kp + ki * told.velocity_feedforward
     return replace(
         plain,
-        kp_nm_per_rad=kp,
+        kp_nm_per_rad=told.kv * told.kp,
         ki_nm_per_rad_s=ki * told.kp,
         kd_nm_s_per_rad=told.kv,
-        command_weight=command_nm / kp if kp > 0.0 else 1.0,
         command_rate_weight=told.velocity_feedforward,
+        cascade=ki > 0.0,
     )
 
 

@@ -53,6 +53,7 @@ def _rates(view: View, nominal: Nominal, controller: Controller) -> Array:
     rates[:, BRISTLE, VELOCITY] = stuck * view.stiffness_nm_per_rad
     rates[:, BRISTLE, BRISTLE] = -forgets_per_s
     rates[:, INTEGRAL, POSITION] = -controller.ki_nm_per_rad_s
+    rates[:, INTEGRAL, SEEN] = -controller.inner_nm_per_rad
     rates[:, SEEN, VELOCITY] = 1.0 / seen_s
     rates[:, SEEN, SEEN] = -1.0 / seen_s
     return rates

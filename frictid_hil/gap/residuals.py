@@ -23,7 +23,15 @@ from scipy import interpolate, signal
 
 from frictid_hil.config.nominal import ReportFilter
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.experiment_set import LOG_COLUMNS, Controller, Experiment, ExperimentSet, Nominal
+from frictid_hil.gap.experiment_set import (
+    GAINS,
+    LOG_COLUMNS,
+    Controller,
+    Experiment,
+    ExperimentSet,
+    Nominal,
+    with_gains,
+)
 from frictid_hil.simulation.inverse import View
 from frictid_hil.simulation.inverse_loops import bent, lagged
 from frictid_hil.simulation.joint import Payload
@@ -32,6 +40,7 @@ CUTOFF_HZ = 20.0  # low-pass of everything that is compared (zero phase, fourth 
 
 LATE = (0.5, 0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0)
 """How late a row's torque may be, in rows; the mean over the row comes first."""
+LEAST_SHARE = 0.01  # change of a gain by which its part of the demand is formed, at least
 SETTLED_S = 0.5  # the controller's integral is unknown at the start; its level is read from this first stretch
 
 
@@ -344,8 +353,10 @@ def controller_demand(
         feed = np.gradient(command, tick_s)
     error = command - position
     direct = controller.kp_nm_per_rad * error + controller.added_nm(command, tick_s)
-    direct += controller.kd_nm_s_per_rad * (controller.command_rate_weight * feed - velocity)
-    demand = _integrated(direct, controller.ki_nm_per_rad_s * tick_s * error, controller.torque_limit_nm, integral_nm)
+    inner = controller.command_rate_weight * feed - velocity
+    direct += controller.kd_nm_s_per_rad * inner
+    step_nm = tick_s * (controller.ki_nm_per_rad_s * error + controller.inner_nm_per_rad * inner)
+    demand = _integrated(direct, step_nm, controller.torque_limit_nm, integral_nm)
     return demand if every_tick else demand[ticks - 1 :: ticks]
 
 
@@ -372,12 +383,19 @@ def between(column: Array, ticks: int) -> Array:
     return finer.ravel()
 
 
-def demand_parts(controller: Controller, position_rad: Array, command_rad: Array, step_s: float) -> Array:
-    """Proportional, integral and derivative part of the demand, (n, 3); the integral from 0, the limit left out."""
-    gains = {name: getattr(controller, name) for name in ("kp_nm_per_rad", "ki_nm_per_rad_s", "kd_nm_s_per_rad")}
-    off = dict.fromkeys(gains, 0.0)
-    alone = (replace(controller, torque_limit_nm=math.inf, feedforward=None, **{**off, n: k}) for n, k in gains.items())
-    return np.stack([controller_demand(one, position_rad, command_rad, step_s) for one in alone], axis=1)
+def demand_parts(controller: Controller, experiment: Experiment, step_s: float, shares: Sequence[float]) -> Array:
+    """Change of the demand per share of kp, ki and kd, (n, 3), on the way from the stated gains to these shares.
+
+    A limited demand, and that of a cascade, is no sum of such changes; this one is as long as the shares are right.
+    """
+    parts, before = [], demand_of(controller, experiment, step_s)
+    for name, share in zip(GAINS, shares, strict=True):
+        step = share if abs(share) > LEAST_SHARE else LEAST_SHARE
+        controller = with_gains(controller, [step if one == name else 0.0 for one in GAINS])
+        after = demand_of(controller, experiment, step_s)
+        parts.append((after - before) / step)
+        before = after
+    return np.stack(parts, axis=1)
 
 
 @njit(cache=True)

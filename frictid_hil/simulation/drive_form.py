@@ -23,7 +23,7 @@ class DriveView:
     limit_nm: float  # torque limit that the controller knows of; infinite where it has none
     demand_nm: Array  # the controller's replayed demand, in force from each sample on
     torque_nm: Array  # reported
-    # Proportional, integral and derivative part of the demand, (n, 3); empty where no law is known.
+    # Change of the demand per share of kp, ki and kd, (n, 3); empty where no law is known.
     parts_nm: Array = field(default_factory=lambda: np.empty((0, 3)))
 
 

@@ -25,7 +25,7 @@ INERTIA, MOTOR_SHARE, GRAVITY_COS, GRAVITY_SIN, GEAR_RATIO, COULOMB, STIFFNESS =
 PAYLOAD_INERTIA, PAYLOAD_GRAVITY_COS, ENCODER_STEP, ENCODER_ON_MOTOR = range(7, 11)
 KP, KI, KD, CONTROL_FILTER_S, REPORT_FILTER_S, TORQUE_LIMIT = range(11, 17)
 HAND_STIFFNESS, HAND_DAMPING, HAND_CENTRE, HAND_AMPLITUDE, HAND_FREQUENCY = range(17, 22)
-POWERED, BRAKED, CURVE_AT, CURVE_KNOTS, ARM_TORQUE, CORE_PARAMETERS = range(22, 28)
+POWERED, BRAKED, CURVE_AT, CURVE_KNOTS, ARM_TORQUE, CASCADE, CORE_PARAMETERS = range(22, 29)
 
 # Slots of the state vector; effects' states follow.
 TIME, MOTOR_POSITION, MOTOR_VELOCITY, MOTOR_ACCELERATION, LINK_POSITION, LINK_VELOCITY, LINK_ACCELERATION = range(7)
@@ -245,6 +245,10 @@ def control(parameters: Vector, state: Vector, commands: Vector, tick: int, mode
         demand_nm = kp_nm_per_rad * error_rad + state[INTEGRAL]
         demand_nm += kd_nm_s_per_rad * (commands[tick, VELOCITY_COMMAND] - velocity_measured)
         integral_step_nm = ki_nm_per_rad_s * error_rad * period_s
+        if parameters[CASCADE] != 0.0:
+            # The inner loop's integral takes its whole error; ki * kp, kv and kv * kp are what the gains above hold.
+            inner_nm_per_rad = ki_nm_per_rad_s * kd_nm_s_per_rad / kp_nm_per_rad
+            integral_step_nm += inner_nm_per_rad * (commands[tick, VELOCITY_COMMAND] - velocity_measured) * period_s
     demand_nm += commands[tick, TORQUE_OFFSET]
     if abs(demand_nm) > limit_nm:
         demand_nm = math.copysign(limit_nm, demand_nm)

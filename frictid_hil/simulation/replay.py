@@ -25,8 +25,9 @@ CarryOver = Mapping[str, tuple[float, ...]]  # what the joint remembers of a rec
 class Controller:
     """A digital position controller: kp*(cmd - q) + integral(ki*(cmd - q)) + kd*(d cmd/dt - filtered v).
 
-    Its integral starts at the static holding torque and is frozen while the limit is active; v is the backward
-    difference of the measured position behind a first-order filter.
+    A ``cascade`` integrates ki*kd/kp*(d cmd/dt - filtered v) as well: the error of its inner loop. The integral starts
+    at the static holding torque and is frozen while the limit is active; v is the backward difference of the measured
+    position behind a first-order filter.
     """
 
     kp_nm_per_rad: float  # proportional gain
@@ -39,6 +40,7 @@ class Controller:
     # set-points as they come.
     command_rate: str = "central"
     command_rate_weight: float = 1.0  # share of d cmd/dt that enters; 0 in a cascade that damps the motion itself
+    cascade: bool = False  # an inner loop with an integral; kp and kd are positive
     # (command (n,), step in s) -> torque added along the command (n,); None adds none.
     added_nm: Callable[[Array, float], Array] | None = None
 
@@ -87,6 +89,7 @@ def closed_loop(
     parameters[plant.KP] = controller.kp_nm_per_rad
     parameters[plant.KI] = controller.ki_nm_per_rad_s
     parameters[plant.KD] = controller.kd_nm_s_per_rad
+    parameters[plant.CASCADE] = float(controller.cascade)
     parameters[plant.CONTROL_FILTER_S] = controller.velocity_filter_s
     parameters[plant.TORQUE_LIMIT] = min(controller.torque_limit_nm, model.drive.torque_limit_nm)
     rows = _simulate(parameters, commands, period_s, plant.POSITION_MODE, float(command[0]), state, time)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -70,14 +71,7 @@ def make(
     model = nominal_model(nominal).with_effects(effects or {})
     c = nominal.controller
     assert c is not None
-    loop = Loop(
-        c.kp_nm_per_rad,
-        c.ki_nm_per_rad_s,
-        c.kd_nm_s_per_rad,
-        c.rate_hz,
-        c.velocity_filter_s,
-        c.torque_limit_nm,
-    )
+    loop = Loop(**{field.name: getattr(c, field.name) for field in fields(Loop)})
     state = None
     experiments = []
     for order, (name, (command, payload, validation)) in enumerate(commands().items()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,16 @@ import yaml
 
 from frictid_hil.config.profile import Estimate, JointProfile
 from frictid_hil.errors import ConfigError, InputFileError
-from frictid_hil.gap.experiment_set import Controller, ExperimentSet
-from frictid_hil.gap.residuals import controller_demand
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet
+from frictid_hil.gap.forward import nominal_model
+from frictid_hil.gap.nuisances import bent_rate_nm
+from frictid_hil.gap.residuals import controller_demand, demand_of, demand_parts, recordings
 from frictid_hil.gap.sanity import checked
 from frictid_hil.gap.tolerances import RELATIVE_BY_KIND, Tolerances, stated_by
+from frictid_hil.simulation.replay import Controller as Loop
+from frictid_hil.simulation.replay import Simulated, closed_loop
 
 TIME_S = 0.01 * np.arange(1000)
 
@@ -155,22 +162,35 @@ def test_a_law_may_be_unknown_or_a_column(tmp_path: Path, told: dict[str, Any]) 
 
 def test_a_replay_follows_a_cascade() -> None:
     """The same cascade, replayed on the motion it made, asks for the torque it gave."""
-    from frictid_hil.gap.forward import nominal_model
-    from frictid_hil.simulation.replay import Controller as Loop
-    from frictid_hil.simulation.replay import closed_loop
-
-    c = replace(gap_sets.NOMINAL.controller, command_weight=0.9, command_rate_weight=0.0, command_rate="backward")
-    loop = Loop(
-        c.kp_nm_per_rad, c.ki_nm_per_rad_s, c.kd_nm_s_per_rad, c.rate_hz, c.velocity_filter_s, c.torque_limit_nm,
-        c.command_rate, c.command_rate_weight, c.added_nm,
-    )  # fmt: skip
-    time_s = 0.002 * np.arange(1500)
-    command = 0.3 * (1.0 - np.cos(2.0 * time_s))
-    rows = closed_loop(nominal_model(gap_sets.NOMINAL), loop, time_s, command)
-    asked = controller_demand(c, rows.position_rad, command, 0.002)
+    rows, command = _cascaded(CASCADE)
+    asked = controller_demand(CASCADE, rows.position_rad, command, 0.002)
     error = (rows.torque_nm[1:] - asked[:-1])[50:]
     assert np.ptp(rows.torque_nm) > 5.0
     assert np.std(error) < 0.02 * np.std(rows.torque_nm)
+
+
+def test_errors_of_a_cascades_gains_act_alike_in_demand_and_simulator() -> None:
+    """kp 10 % higher, ki 20 % lower, kv 15 % lower: shares of kv*kp, ki*kp and kv, and ki with all three."""
+    shares = {"kp_error_share": 1.1 * 0.85 - 1.0, "ki_error_share": 1.1 * 0.8 - 1.0, "kd_error_share": 0.85 - 1.0}
+    rows, command = _cascaded(CASCADE, controller_gain_error=shares)
+    told = {"position_command_rad": command, "torque_nm": rows.torque_nm}
+    log = Experiment("a", False, False, 0, 0.002 * np.arange(1500), rows.position_rad, **told)
+    left = rows.torque_nm[1:] - demand_of(CASCADE, log, 0.002)[:-1]
+    made = (demand_parts(CASCADE, log, 0.002, list(shares.values())) @ list(shares.values()))[:-1]
+    assert np.std(left[50:]) > 10.0 * np.std((left - made)[50:])
+
+
+CASCADE = replace(
+    gap_sets.NOMINAL.controller, ki_nm_per_rad_s=2600.0, command_rate_weight=0.0, command_rate="backward", cascade=True
+)
+
+
+def _cascaded(law: Controller, **effects: Mapping[str, float]) -> tuple[Simulated, Array]:
+    """The joint of the tests under a cascade, and its command, every 2 ms."""
+    loop = Loop(**{f.name: getattr(law, f.name) for f in fields(Loop)})
+    command = 0.3 * (1.0 - np.cos(2.0 * 0.002 * np.arange(1500)))
+    joint = nominal_model(gap_sets.NOMINAL).with_effects(effects)
+    return closed_loop(joint, loop, 0.002 * np.arange(1500), command), command
 
 
 def test_the_page_shows_the_defaults_that_hold() -> None:
@@ -178,3 +198,19 @@ def test_the_page_shows_the_defaults_that_hold() -> None:
     for name, kinds in RELATIVE_BY_KIND.items():
         cells = " | ".join("exact" if share == 0.0 else f"{100 * share:.3g} %" for share in kinds.values())
         assert f"| `{name}` | {cells} |" in page
+
+
+def test_what_depends_on_speed_begins_where_the_curve_does() -> None:
+    """Friction that rises as the square root of speed is far lower at rest than a line through its first pairs says."""
+    speeds = np.geomspace(0.02, 1.8, 12)
+    curve = FrictionCurve.through(speeds, 2.6 + 1.6 * np.sqrt(speeds))
+    nominal = replace(gap_sets.NOMINAL, curve=curve)
+    (r, *_) = recordings(gap_sets.make(nominal=nominal, only=("sines_small",)))
+    assert r.view is not None
+    (bent,) = bent_rate_nm(nominal, [r.view])
+    measured = (r.view.velocity_rad_s > 0.05) & (r.view.slip == 1.0)
+    expected = 1.6 * np.sqrt(r.view.velocity_rad_s[measured])
+    assert np.allclose(bent[measured, 0], expected, atol=0.02)
+    assert not np.allclose(r.view.rate_nm[measured], expected, atol=0.1)
+    straight = replace(nominal, curve=FrictionCurve.through(speeds, 2.6 + 1.6 * speeds))
+    assert bent_rate_nm(straight, [r.view]) == []

@@ -29,8 +29,9 @@ EFFECT = Effect(
     documentation=(
         "Gains are read in the drive's own units and converted by hand: kp, ki and kd are each (1 + error) times "
         "what is believed. The replayed demand then differs from the torque reported by a share of its proportional, "
-        "integral and derivative part; the plant itself is innocent. Source: K. J. Astrom, T. Hagglund, 'Advanced "
-        "PID Control', 2006, chapter 3 (the parts of the law and the units that vendors give them in)."
+        "integral and derivative part; the plant itself is innocent. Of a cascade kv*w + integral(ki*w) with "
+        "w = kp*e - v, the three are kv*kp, ki*kp and kv. Source: K. J. Astrom, T. Hagglund, 'Advanced PID Control', "
+        "2006, chapter 3 (the parts of the law and the units that vendors give them in)."
     ),
     parameters=(
         Parameter("kp_error_share", -0.9, 4.0, 0.1, "true over believed proportional gain, minus 1", off=0.0),

@@ -1,0 +1,56 @@
+"""Errors of a controller's gains: in a cascade, where the demand is limited, and behind a coarse encoder."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gap_sets
+import numpy as np
+import pytest
+
+from frictid_hil.gap.diagnose import diagnose
+from frictid_hil.gap.diagnosis import Diagnosis
+from frictid_hil.gap.experiment_set import GAINS, Controller
+
+PID = gap_sets.NOMINAL.controller
+assert PID is not None
+CASCADE = replace(PID, command_rate_weight=0.0, cascade=True)
+LIMITED = replace(PID, torque_limit_nm=11.0)  # reached where the joint speeds up and where it breaks away
+SHARES = {"kp_error_share": 0.2, "ki_error_share": -0.3, "kd_error_share": -0.15}
+
+
+def told(controller: Controller, coarse_rad: float = 2e-6, **more: dict[str, float]) -> Diagnosis:
+    """A joint whose gains are off, and what is said of it."""
+    nominal = replace(gap_sets.NOMINAL, controller=controller, encoder_resolution_rad=coarse_rad)
+    return diagnose(gap_sets.make({"controller_gain_error": SHARES, **more}, nominal))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("controller", [PID, CASCADE, LIMITED], ids=["pid", "cascade", "limited"])
+def test_each_gain_is_found_and_the_loop_closes(controller: Controller) -> None:
+    found = told(controller)
+    assert found.verdict == "explained" and [c.effect for c in found.causes] == ["controller_gain_error"]
+    for name, share in SHARES.items():
+        value = found.causes[0].parameters[name]
+        assert value.value == pytest.approx(share, abs=0.03)
+        assert value.low is not None and value.high is not None and value.low < share < value.high
+    assert found.after.forward_torque_nm is not None and found.before.forward_torque_nm is not None
+    assert found.after.forward_torque_nm < 0.2 * found.before.forward_torque_nm
+
+
+def test_the_limit_is_reached() -> None:
+    (log, *_) = gap_sets.make({}, replace(gap_sets.NOMINAL, controller=LIMITED), only=("sines_large",)).experiments
+    assert log.torque_nm is not None and np.max(np.abs(log.torque_nm)) > 0.98 * LIMITED.torque_limit_nm
+
+
+@pytest.mark.slow
+def test_behind_a_coarse_encoder_the_joint_is_read_under_the_true_gains() -> None:
+    found = told(PID, 6e-4, gravity_error={"error_share": 0.1})
+    assert "encoder" in found.reasons and found.verdict == "explained"
+    assert {"controller_gain_error", "gravity_error"} <= {c.effect for c in found.causes if c.confidence > 0.8}
+    gravity = next(c for c in found.causes if c.effect == "gravity_error").parameters["error_share"]
+    assert gravity.value == pytest.approx(0.1, abs=0.03)
+
+
+def test_gains_are_named_once() -> None:
+    assert [name.split("_")[0] for name in GAINS] == [name.split("_")[0] for name in SHARES]
