@@ -17,6 +17,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
+from frictid_hil.gap.forward import Replay, settled_nm, why_not
 from frictid_hil.gap.residuals import LowPass, Recording, presliding_state, recordings
 
 GRADUALLY = (
@@ -32,7 +33,7 @@ SLOW_RAD_S = (0.01, 0.05)
 BEGINS_RAD_S = 0.02  # speed at which friction counts as that of a joint that begins to slide
 WRONG = 0.1  # error of the level, over it, from which on the travel is in question
 ROUNDS = 3  # times that level and travel are fitted to one another
-CLEARLY = 0.95  # squares that remain with another travel, over those with the believed one, at most
+CLEARLY = 0.95  # squares that remain with another form or travel, over those with the believed one, at most
 
 
 def as_it_yields(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]:
@@ -49,9 +50,20 @@ def as_it_yields(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]
     told: str | None = GRADUALLY
     form = replace(nominal, yields_gradually=True)
     at_once, level_nm = _fit(logs, nominal)
-    if _fit(logs, form)[0] >= at_once:
+    gradually, _ = _fit(logs, form)
+    if gradually > at_once or (gradually > CLEARLY * at_once and not _nearer_in_the_loop(experiments, form)):
         form, told = _with_own_travel(logs, nominal, at_once, level_nm)
     return replace(experiments, nominal=form), told
+
+
+def _nearer_in_the_loop(experiments: ExperimentSet, form: Nominal) -> bool:
+    """Whether another form brings the simulated closed loop nearer: an encoder may hide it along the motion."""
+    if why_not(experiments) is not None:
+        return False
+    both = (replace(experiments, nominal=nominal) for nominal in (experiments.nominal, form))
+    with np.errstate(over="ignore", invalid="ignore"):
+        believed_nm, other_nm = (settled_nm(Replay(one)({})) for one in both)
+    return other_nm**2 < CLEARLY * believed_nm**2
 
 
 def _with_own_travel(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.gap import presliding
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.presliding import as_it_yields
@@ -74,6 +75,14 @@ def test_the_form_is_read_off_the_recordings(bristle: bool) -> None:
     experiments, told = as_it_yields(recorded(BELIEF, bristle))
     assert (experiments.nominal.yields_gradually is True) is bristle
     assert (told is not None) is bristle
+
+
+def test_a_form_that_hardly_fits_better_is_no_other_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As behind an encoder whose counts are longer than the way that friction builds up over."""
+    squares = {True: 0.97, None: 1.0}
+    monkeypatch.setattr(presliding, "_fit", lambda logs, form: (squares[form.yields_gradually], LEVEL_NM))
+    experiments, told = as_it_yields(recorded(BELIEF, bristle=False))
+    assert experiments.nominal.yields_gradually is None and told is None
 
 
 def test_more_friction_on_a_spring_of_the_stated_stiffness_bends_it_further() -> None:
