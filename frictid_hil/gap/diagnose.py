@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replayed
-from frictid_hil.gap.borne_out import Loop, borne_out, of_the_drive
+from frictid_hil.gap.borne_out import Loop, borne_out
 from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, ONE_SINUSOID, below_first_pair, one_sinusoid
 from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.command_timing import in_force
@@ -92,9 +92,10 @@ def diagnose(
     quiet = _raw_quiet(channels, negligible)
     along = loop = None
     if simulation is not None and believed and _hides(channels[0], gaps[0], found, simulation):
-        drive = _values(f for f in found if of_the_drive(f) and f.chance >= UNDECIDED)
+        drive = _values(f for f in found if f.where == "actuation" and f.chance >= UNDECIDED)
         raw = channels[0].posterior.channel.raw
-        loop = loop_channel(nominal, believed, simulation, drive, allowed, reasons, raw)
+        steady = [name for name in allowed if not swings(name)]
+        loop = loop_channel(nominal, believed, simulation, drive, steady, reasons, raw)
     if loop is not None:
         reasons["encoder"], along = HIDES, channels[0]
         channels = [sampled(Posterior(loop, len(allowed))), *channels[1:]]
@@ -106,6 +107,7 @@ def diagnose(
     if (warning := below_first_pair(said.named, nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if simulation is not None and said.named and said.word != "none":
+        said = _ranked(said, simulation, gaps)
         open_along = any(gap.channel in ("plant", "loop") and stays(gap, HALF, floors=1.0) for gap in gaps)
         said, told = borne_out(said, _loop(simulation, gaps, nothing_nm), open_along=open_along)
         if told is not None:
@@ -268,10 +270,25 @@ def _tolerable(
     return _values(likely)
 
 
+def _ranked(said: Verdict, simulation: Simulation, gaps: Sequence[Closed]) -> Verdict:
+    """The verdict, causes first that make most where they show most: in a channel, or in the simulated closed loop."""
+    noise_nm, sizes = _noise_nm(simulation, gaps), {}
+    if noise_nm == 0.0:
+        return said  # no log has a torque
+    for f in said.named:
+        made_nm = simulation.made_nm(_values([f])) if f.parameters else 0.0
+        sizes[f.effect] = max(f.size, math.sqrt(f.chance) * made_nm / noise_nm)
+    return replace(said, named=tuple(sorted(said.named, key=lambda f: -sizes[f.effect])))
+
+
+def _noise_nm(simulation: Simulation, gaps: Sequence[Closed]) -> float:
+    """RMS that noise alone leaves of the closed loop's torque, N m."""
+    return max([simulation.noise_nm, *(gap.floor for gap in gaps if gap.channel == "actuation")])
+
+
 def _loop(simulation: Simulation, gaps: Sequence[Closed], negligible_nm: float) -> Loop:
     """The closed loop on the logs a gap is told of, as it judges causes."""
-    noise_nm = max([simulation.noise_nm, *(gap.floor for gap in gaps if gap.channel == "actuation")])
-    return Loop(simulation.gap_nm, settled_nm(simulation.bare), noise_nm, negligible_nm)
+    return Loop(simulation.gap_nm, settled_nm(simulation.bare), _noise_nm(simulation, gaps), negligible_nm)
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:

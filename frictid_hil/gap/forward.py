@@ -210,6 +210,13 @@ class Simulation:
         """RMS that both make of it."""
         return math.hypot(self.white_nm, self.steps_nm)
 
+    def made_nm(self, effects: Effects) -> float:
+        """RMS of what effects change of the torque, N m; infinite where no controller holds the joint."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            run = self.replay(effects, validation=self.validation)
+            made = rms(np.concatenate([(g.torque_nm - run[n].torque_nm)[g.settled :] for n, g in self.bare.items()]))
+        return made if math.isfinite(made) else math.inf
+
     def gap_nm(self, effects: Effects) -> float:
         """RMS of the torque gap with effects added, N m; infinite where no controller holds the joint."""
         with np.errstate(over="ignore", invalid="ignore"):

@@ -11,20 +11,26 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Channel, Rows
-from frictid_hil.gap.experiment_set import Nominal
+from frictid_hil.gap.experiment_set import GAINS, Nominal, with_gains
 from frictid_hil.gap.forward import Effects, Replayed, Simulation
 from frictid_hil.gap.linear_loop import answered
 from frictid_hil.gap.plant_channel import heard, no_louder, terms_of, without_nuisances
 from frictid_hil.gap.residuals import LowPass, Recording, reported, rms
+
+STANDS_S = 0.5  # time for which a joint must not leave its place to stand
+COUNTS = 2.0  # of its encoder that it may flicker by
+NO_ERROR = dict.fromkeys(GAINS, 0.0)
 
 
 def loop_channel(
     nominal: Nominal,  # the believed joint
     believed: Sequence[Recording],  # it, recorded as the set was, its encoder without steps
     simulation: Simulation,
-    beside: Effects,  # causes of the drive, which are known to be there
+    beside: Effects,  # causes that show between demand and torque, which are known to be there
     library: Collection[str],  # effects that may be used
     estimated: Collection[str],  # as for the plant channel
     raw: tuple[float, float],  # of the plant channel
@@ -41,14 +47,17 @@ def loop_channel(
     scale = rms(np.concatenate([gap.torque_nm[gap.settled :] for gap in gaps]))
     builder, known, candidates = terms_of(nominal, views, left, believed, library, estimated, scale)
     low_pass = LowPass.at(1.0 / believed[0].step_s)
-    controller, report = nominal.controller, nominal.torque_report_filter
-    assert controller is not None
+    report = nominal.torque_report_filter
+    assert nominal.controller is not None
+    controller = with_gains(nominal.controller, list(beside.get("controller_gain_error", NO_ERROR).values()))
     rows = []
     for r, view, gap, blocks in zip(believed, views, gaps, builder.parts, strict=True):
         columns = answered(np.concatenate(blocks, axis=1), view, nominal, controller)
         table = low_pass.thinned(reported(columns, report, r.step_s))
         steps_nm = gap.torque_nm - smooth[r.experiment.name].torque_nm
-        rows.append(no_louder(_rows(r, gap, table, steps_nm, low_pass)))
+        reach_rad = max(COUNTS * (nominal.encoder_resolution_rad or 0.0), view.coulomb_nm / view.stiffness_nm_per_rad)
+        noise_nm = steps_nm + drift_nm(gap.torque_nm, view.position_rad + gap.position_rad, reach_rad, r.step_s)
+        rows.append(no_louder(_rows(r, gap, table, noise_nm, low_pass)))
     step_s = believed[0].step_s * low_pass.stride
     rows = heard(without_nuisances(rows, known, candidates), simulation.white_nm, views[0].coulomb_nm, step_s)
     return Channel(
@@ -64,10 +73,27 @@ def loop_channel(
     )
 
 
-def _rows(r: Recording, gap: Replayed, table: np.ndarray, steps_nm: np.ndarray, low_pass: LowPass) -> Rows:
+def drift_nm(torque_nm: Array, position_rad: Array, reach_rad: float, step_s: float) -> Array:
+    """What torque differs by since a joint has come to stand, (n,): wherever friction holds it, the integral runs on.
+
+    A joint stands that has not travelled further than ``reach_rad`` for ``STANDS_S``.
+    """
+    window = round(STANDS_S / step_s) + 1
+    past = (window - 1) // 2  # the window ends at its row
+    highest = ndimage.maximum_filter1d(position_rad, window, mode="nearest", origin=past)
+    lowest = ndimage.minimum_filter1d(position_rad, window, mode="nearest", origin=past)
+    stands = highest - lowest <= reach_rad
+    stands[:window] = False
+    comes = stands & ~np.concatenate([[False], stands[:-1]])
+    since = np.maximum.accumulate(np.where(comes, np.arange(stands.size), 0))
+    drift: Array = np.where(stands, torque_nm - torque_nm[since], 0.0)
+    return drift
+
+
+def _rows(r: Recording, gap: Replayed, table: np.ndarray, noise_nm: np.ndarray, low_pass: LowPass) -> Rows:
     """One log from where it has settled; its difference has passed the low-pass already."""
     first, stride = gap.settled // low_pass.stride + 1, low_pass.stride
     x = table[first:-2]
-    y, noise = (column[::stride][first : first + x.shape[0]] for column in (gap.torque_nm, steps_nm))
+    y, noise = (column[::stride][first : first + x.shape[0]] for column in (gap.torque_nm, noise_nm))
     told = np.ones(y.size, dtype=bool)
     return Rows(r.experiment.name, r.experiment.validation, first * stride * r.step_s, y, x, noise, told)

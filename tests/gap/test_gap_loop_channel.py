@@ -14,7 +14,7 @@ from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import Nominal
 from frictid_hil.gap.forward import Effects, Replay, Simulation
 from frictid_hil.gap.linear_loop import answered
-from frictid_hil.gap.loop_channel import loop_channel
+from frictid_hil.gap.loop_channel import STANDS_S, drift_nm, loop_channel
 from frictid_hil.gap.residuals import LowPass, recordings, rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -75,6 +75,18 @@ def test_a_joint_at_rest_does_not_ring_up() -> None:
     at_rest = replace(r.view, velocity_rad_s=tremble, slip=np.full_like(tremble, 0.98), gradual_rad=2e-4)
     asked = np.ones((tremble.size, 1))
     assert float(np.max(np.abs(answered(asked, at_rest, nominal, nominal.controller)))) < 3.0
+
+
+def test_a_standing_joints_integral_says_nothing() -> None:
+    """It moves for a second, stands for two, flickering by a count, and moves on."""
+    step_s, count_rad = 0.002, 1e-3
+    time_s = step_s * np.arange(2000)
+    position = np.where(time_s < 1.0, 0.3 * time_s, np.where(time_s < 3.0, 0.3, 0.3 + 0.3 * (time_s - 3.0)))
+    position = position + count_rad * (np.arange(2000) % 2)
+    drift = drift_nm(0.1 * time_s, position, 2.0 * count_rad, step_s)
+    stands = (time_s > 1.0 + STANDS_S + 0.01) & (time_s < 3.0)
+    assert np.all(drift[time_s < 1.0 + STANDS_S - 0.01] == 0.0) and np.all(drift[time_s > 3.01] == 0.0)
+    assert np.allclose(drift[stands], 0.1 * (time_s[stands] - 1.0 - STANDS_S), atol=2e-3)
 
 
 def told(effects: dict[str, dict[str, float]]) -> Diagnosis:
