@@ -33,6 +33,7 @@ from frictid_hil.gap import (
     findings,
     generic,
     how_far,
+    linear_loop,
     noise,
     nuisances,
     plainest,
@@ -69,6 +70,7 @@ TABLES: tuple[tuple[ModuleType, str], ...] = (
     (plant_channel, "BEYOND"), (plant_channel, "SIZES"), (plant_channel, "SWAMPED"), (plant_channel, "UNTOLD"),
     (plant_channel, "LINE_SHARE"), (generic, "WAYS_RAD"), (generic, "REST_S"), (generic, "STILL_S"),
     (generic, "REACHES"), (nuisances, "FREE"), (nuisances, "STIFFER"), (actuation_channel, "WITHIN_ROWS"),
+    (diagnosis, "COARSE"), (linear_loop, "CREEP"),
 )  # fmt: skip
 """The tables of the channels."""
 CHANCES = ("SIDED", "DOUBTED", "NEEDED", "CERTAIN", "LEADS", "EVEN", "UNTOLD", "REFUTED", "UNDECIDED", "LISTED")
