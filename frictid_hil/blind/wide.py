@@ -497,7 +497,9 @@ def _in_rows(setting: Setting, runs: Sequence[Run]) -> dict[str, list[Array]]:
     tick, thin, step_s = setting.control.tick, setting.thin, setting.step_s
     shown: dict[str, list[Array]] = {"inverse": []}
     if setting.controller != "unknown":
-        shown |= {"torque": [], "actuation": []}
+        shown["torque"] = []
+        if thin == 1:  # what a controller asked for between the rows of its log nobody knows
+            shown["actuation"] = []
     for (q, torque, _), motion in zip(runs, setting.motions, strict=True):
         kept, read = q[::thin], _reported(setting, torque, tick)[::thin]
         centred = read + 0.5 / thin * np.diff(read, append=read[-1])
@@ -506,10 +508,10 @@ def _in_rows(setting: Setting, runs: Sequence[Run]) -> dict[str, list[Array]]:
         if setting.controller == "unknown":
             continue
         shown["torque"].append(low_pass(read, 1.0 / step_s))
-        ticks = np.arange(q.size)
-        between = np.interp(ticks, ticks[::thin], kept)
-        demand = _reported(setting, asked(setting.control, motion.command, between, float(torque[0])), tick)
-        late = read - np.concatenate([demand[:1], demand[:-1]])[::thin]
+        if thin > 1:
+            continue
+        demand = _reported(setting, asked(setting.control, motion.command, q, float(torque[0])), tick)
+        late = read - np.concatenate([demand[:1], demand[:-1]])
         shown["actuation"].append(low_pass(late - np.median(late[: round(0.5 / step_s)]), 1.0 / step_s))
     return shown
 

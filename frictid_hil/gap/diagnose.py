@@ -107,7 +107,7 @@ def diagnose(
     if (warning := below_first_pair(said.named, nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if simulation is not None and said.named and said.word != "none":
-        said = _ranked(said, simulation, gaps)
+        said = _ranked(said, simulation, channels, gaps)
         open_along = any(gap.channel in ("plant", "loop") and stays(gap, HALF, floors=1.0) for gap in gaps)
         said, told = borne_out(said, _loop(simulation, gaps, nothing_nm), open_along=open_along)
         if told is not None:
@@ -270,14 +270,19 @@ def _tolerable(
     return _values(likely)
 
 
-def _ranked(said: Verdict, simulation: Simulation, gaps: Sequence[Closed]) -> Verdict:
-    """The verdict, causes first that make most where they show most: in a channel, or in the simulated closed loop."""
-    noise_nm, sizes = _noise_nm(simulation, gaps), {}
-    if noise_nm == 0.0:
-        return said  # no log has a torque
-    for f in said.named:
-        made_nm = simulation.made_nm(_values([f])) if f.parameters else 0.0
-        sizes[f.effect] = max(f.size, math.sqrt(f.chance) * made_nm / noise_nm)
+def _ranked(said: Verdict, simulation: Simulation, channels: Sequence[Sampled], gaps: Sequence[Closed]) -> Verdict:
+    """The verdict, causes first that make most where they show most: in a channel, or in the simulated closed loop.
+
+    Between the rows of its log a controller's demand is a guess: what shows there is measured in closed loop alone.
+    """
+    noise_nm = _noise_nm(simulation, gaps)
+    if noise_nm == 0.0 or len(said.named) < 2:
+        return said  # no log has a torque, or there is nothing to put in order
+    guessed = {c.posterior.channel.name for c in channels if c.posterior.channel.between_rows}
+    sizes = {f.effect: 0.0 if f.where in guessed else f.size for f in said.named}
+    made_nm = simulation.made_nm([_values([f]) for f in said.named])
+    for f, made in zip(said.named, made_nm, strict=True):
+        sizes[f.effect] = max(sizes[f.effect], math.sqrt(f.chance) * made / noise_nm)
     return replace(said, named=tuple(sorted(said.named, key=lambda f: -sizes[f.effect])))
 
 

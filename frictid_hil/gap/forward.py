@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -210,12 +210,16 @@ class Simulation:
         """RMS that both make of it."""
         return math.hypot(self.white_nm, self.steps_nm)
 
-    def made_nm(self, effects: Effects) -> float:
-        """RMS of what effects change of the torque, N m; infinite where no controller holds the joint."""
+    def made_nm(self, each: Sequence[Effects]) -> list[float]:
+        """RMS of what each of these effects changes of the torque of all logs, N m; infinite where a loop runs away."""
+        bare = self.replay({})
+        made = []
         with np.errstate(over="ignore", invalid="ignore"):
-            run = self.replay(effects, validation=self.validation)
-            made = rms(np.concatenate([(g.torque_nm - run[n].torque_nm)[g.settled :] for n, g in self.bare.items()]))
-        return made if math.isfinite(made) else math.inf
+            for effects in each:
+                run = self.replay(effects) if effects else bare
+                apart = [(g.torque_nm - run[name].torque_nm)[g.settled :] for name, g in bare.items()]
+                made.append(rms(np.concatenate(apart)))
+        return [one if math.isfinite(one) else math.inf for one in made]
 
     def gap_nm(self, effects: Effects) -> float:
         """RMS of the torque gap with effects added, N m; infinite where no controller holds the joint."""
