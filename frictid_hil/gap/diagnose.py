@@ -16,7 +16,7 @@ from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replaye
 from frictid_hil.gap.borne_out import Loop, borne_out
 from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, ONE_SINUSOID, below_first_pair, one_sinusoid
 from frictid_hil.gap.channel import Channel
-from frictid_hil.gap.command_timing import in_force
+from frictid_hil.gap.command_timing import between_rows, in_force
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw, Value
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import Finding, Sampled, either_way, findings, sampled, whole_draws
@@ -86,28 +86,22 @@ def diagnose(
     believed = _believed(experiments, simulation)
     found_in = _channels(nominal, logs, allowed, reasons, kinematic, believed)
     channels = [sampled(Posterior(c, len(allowed))) for c in found_in]
-    found = _with_readings(findings(channels), kinematic, logs, channels, nominal)
-    gaps = _closed(channels, found)
+    found, gaps = _read(channels, kinematic, logs, nominal)
     nothing_nm = _negligible(nominal, channels, negligible)
     quiet = _raw_quiet(channels, negligible)
-    along = loop = None
+    loop = along = None
     if simulation is not None and believed and _hides(channels[0], gaps[0], found, simulation):
-        drive = _values(f for f in found if f.where == "actuation" and f.chance >= UNDECIDED)
-        raw = channels[0].posterior.channel.raw
-        steady = [name for name in allowed if not swings(name)]
-        loop = loop_channel(nominal, believed, simulation, drive, steady, reasons, raw)
+        loop = _of_the_loop(nominal, channels[0], found, believed, simulation, allowed, reasons)
     if loop is not None:
-        reasons["encoder"], along = HIDES, channels[0]
-        channels = [sampled(Posterior(loop, len(allowed))), *channels[1:]]
-        found = _with_readings(findings(channels), kinematic, logs, channels, nominal)
-        gaps = _closed(channels, found)
+        along, channels = channels[0], [sampled(Posterior(loop, len(allowed))), *channels[1:]]
+        found, gaps = _read(channels, kinematic, logs, nominal)
     if quiet and simulation is not None:
         quiet = _quiet_in_the_loop(simulation, found, channels, gaps, nothing_nm)
     said = verdict(found, channels, gaps, nothing_nm, quiet)
     if (warning := below_first_pair(said.named, nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if simulation is not None and said.named and said.word != "none":
-        said = _ranked(said, simulation, channels, gaps)
+        said = _ranked(said, simulation, gaps, guessed=between_rows(nominal.controller, logs[0].step_s))
         open_along = any(gap.channel in ("plant", "loop") and stays(gap, HALF, floors=1.0) for gap in gaps)
         said, told = borne_out(said, _loop(simulation, gaps, nothing_nm), open_along=open_along)
         if told is not None:
@@ -116,6 +110,33 @@ def diagnose(
     said = _cautious(said, reasons, any(r.experiment.validation for r in logs))
     gaps = gaps if along is None else [*gaps, *_closed([along], said.named)]
     return _told(experiments, logs, channels, gaps, said, reasons, simulation)
+
+
+def _read(
+    channels: Sequence[Sampled], kinematic: Mapping[str, float], logs: Sequence[Recording], nominal: Nominal
+) -> tuple[list[Finding], list[Closed]]:
+    """(causes, gap of each channel without them and with those that are likelier there than not)."""
+    found = _with_readings(findings(channels), kinematic, logs, channels, nominal)
+    return found, _closed(channels, found)
+
+
+def _of_the_loop(
+    nominal: Nominal,
+    along: Sampled,
+    found: Sequence[Finding],
+    believed: Sequence[Recording],
+    simulation: Simulation,
+    allowed: Sequence[str],
+    reasons: dict[str, str],
+) -> Channel | None:
+    """The loop channel, with what shows between demand and torque simulated beside; None where that runs away."""
+    beside = _values(f for f in found if f.where == "actuation" and f.chance >= UNDECIDED)
+    steady = [name for name in allowed if not swings(name)]
+    raw = along.posterior.channel.raw
+    loop = loop_channel(nominal, believed, simulation, beside, steady, reasons, raw)
+    if loop is not None:
+        reasons["encoder"] = HIDES
+    return loop
 
 
 def _closed(channels: Sequence[Sampled], named: Sequence[Finding]) -> list[Closed]:
@@ -270,16 +291,16 @@ def _tolerable(
     return _values(likely)
 
 
-def _ranked(said: Verdict, simulation: Simulation, channels: Sequence[Sampled], gaps: Sequence[Closed]) -> Verdict:
+def _ranked(said: Verdict, simulation: Simulation, gaps: Sequence[Closed], *, guessed: bool) -> Verdict:
     """The verdict, causes first that make most where they show most: in a channel, or in the simulated closed loop.
 
-    Between the rows of its log a controller's demand is a guess: what shows there is measured in closed loop alone.
+    Between the rows of its log a controller's demand is a guess: where it is ``guessed``, what shows between demand and
+    torque is measured in closed loop alone.
     """
     noise_nm = _noise_nm(simulation, gaps)
     if noise_nm == 0.0 or len(said.named) < 2:
         return said  # no log has a torque, or there is nothing to put in order
-    guessed = {c.posterior.channel.name for c in channels if c.posterior.channel.between_rows}
-    sizes = {f.effect: 0.0 if f.where in guessed else f.size for f in said.named}
+    sizes = {f.effect: 0.0 if guessed and f.where == "actuation" else f.size for f in said.named}
     made_nm = simulation.made_nm([_values([f]) for f in said.named])
     for f, made in zip(said.named, made_nm, strict=True):
         sizes[f.effect] = max(sizes[f.effect], math.sqrt(f.chance) * made / noise_nm)
