@@ -30,12 +30,12 @@ def in_force(experiments: ExperimentSet) -> ExperimentSet:
     """
     nominal = experiments.nominal
     tables = []
-    if any(_between_rows(nominal, e) for e in experiments.experiments):
+    if any(is_guessed(nominal, e) for e in experiments.experiments):
         known = why_not(experiments) is None
         exact = Replay(experiments).recorded() if known else (None,) * len(experiments.experiments)
         pairs = list(zip(experiments.experiments, exact, strict=True))
         fitted = [(e, own) for e, own in pairs if not e.validation] or pairs
-        tables = [_table(nominal.controller, e, own) for e, own in fitted if _between_rows(nominal, e)]
+        tables = [_table(nominal.controller, e, own) for e, own in fitted if is_guessed(nominal, e)]
     if not tables:
         return experiments
     table = np.concatenate(tables)
@@ -44,8 +44,8 @@ def in_force(experiments: ExperimentSet) -> ExperimentSet:
     return replace(experiments, experiments=tuple(shifted))
 
 
-def _between_rows(nominal: Nominal, e: Experiment) -> bool:
-    """Whether a log whose demand is replayed lacks ticks of its controller."""
+def is_guessed(nominal: Nominal, e: Experiment) -> bool:
+    """Whether a log whose demand is replayed lacks ticks of its controller, so that what was asked for is a guess."""
     known = e.torque_nm is not None and e.position_command_rad is not None and e.torque_demand_nm is None
     return known and between_rows(nominal.controller, e.step_s)
 

@@ -16,7 +16,7 @@ from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replaye
 from frictid_hil.gap.borne_out import Loop, borne_out
 from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, ONE_SINUSOID, below_first_pair, one_sinusoid
 from frictid_hil.gap.channel import Channel
-from frictid_hil.gap.command_timing import between_rows, in_force
+from frictid_hil.gap.command_timing import in_force, is_guessed
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw, Value
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import Finding, Sampled, either_way, findings, sampled, whole_draws
@@ -101,7 +101,7 @@ def diagnose(
     if (warning := below_first_pair(said.named, nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if simulation is not None and said.named and said.word != "none":
-        said = _ranked(said, simulation, gaps, guessed=between_rows(nominal.controller, logs[0].step_s))
+        said = _ranked(said, simulation, gaps, guessed=is_guessed(nominal, logs[0].experiment))
         open_along = any(gap.channel in ("plant", "loop") and stays(gap, HALF, floors=1.0) for gap in gaps)
         said, told = borne_out(said, _loop(simulation, gaps, nothing_nm), open_along=open_along)
         if told is not None:

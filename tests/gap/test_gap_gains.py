@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import gap_sets
 import numpy as np
 import pytest
 
+from frictid_hil.gap import diagnose as diagnosing
 from frictid_hil.gap.diagnose import diagnose
-from frictid_hil.gap.diagnosis import Diagnosis
+from frictid_hil.gap.diagnosis import Diagnosis, Value
 from frictid_hil.gap.experiment_set import GAINS, Controller
+from frictid_hil.gap.findings import Finding
+from frictid_hil.gap.forward import Simulation
+from frictid_hil.gap.verdict import Verdict
 
 PID = gap_sets.NOMINAL.controller
 assert PID is not None
@@ -54,3 +60,16 @@ def test_behind_a_coarse_encoder_the_joint_is_read_under_the_true_gains() -> Non
 
 def test_gains_are_named_once() -> None:
     assert [name.split("_")[0] for name in GAINS] == [name.split("_")[0] for name in SHARES]
+
+
+@pytest.mark.parametrize(("gain", "guessed", "first"), [(2.0, False, 1), (20.0, False, 0), (20.0, True, 1)])
+def test_the_first_cause_makes_most_where_it_shows_most(gain: float, guessed: bool, first: int) -> None:
+    """An error of the joint that makes 16 noise floors of the closed loop's torque, and a gain that makes one."""
+    value = {"any": Value(1.0, 0.9, 1.1)}
+    causes = (
+        Finding("controller_gain_error", 1.0, 1.0, gain, 1.0, value, (), "actuation"),
+        Finding("viscous_error", 1.0, 1.0, 1.5, 0.0, value, (), "plant"),
+    )
+    simulation = cast(Simulation, SimpleNamespace(noise_nm=0.1, made_nm=lambda each: [0.1, 1.6]))
+    said = diagnosing._ranked(Verdict("explained", causes), simulation, [], guessed=guessed)
+    assert said.named[0] is causes[first]
