@@ -145,7 +145,8 @@ def _shares(
     limited = any(float(np.max(np.abs(b))) >= LIMITED * controller.torque_limit_nm for b in base)
     if not (limited or controller.cascade):
         return shares
-    fitted = [(r, y) for r, y in zip(logs, residuals, strict=True) if not r.experiment.validation]
+    pairs = list(zip(logs, residuals, strict=True))
+    fitted = [(r, y) for r, y in pairs if not r.experiment.validation] or pairs
     for _ in range(ROUNDS):
         there = with_gains(controller, shares.tolist())
         tables, rests = [], []

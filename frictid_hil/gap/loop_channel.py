@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Channel, Rows
-from frictid_hil.gap.experiment_set import GAINS, Nominal, with_gains
+from frictid_hil.gap.experiment_set import Nominal, with_gains
 from frictid_hil.gap.forward import Effects, Replayed, Simulation
 from frictid_hil.gap.linear_loop import answered
 from frictid_hil.gap.plant_channel import heard, no_louder, terms_of, without_nuisances
@@ -23,7 +23,6 @@ from frictid_hil.gap.residuals import LowPass, Recording, reported, rms
 
 STANDS_S = 0.5  # time for which a joint must not leave its place to stand
 COUNTS = 2.0  # of its encoder that it may flicker by
-NO_ERROR = dict.fromkeys(GAINS, 0.0)
 
 
 def loop_channel(
@@ -49,7 +48,8 @@ def loop_channel(
     low_pass = LowPass.at(1.0 / believed[0].step_s)
     report = nominal.torque_report_filter
     assert nominal.controller is not None
-    controller = with_gains(nominal.controller, list(beside.get("controller_gain_error", NO_ERROR).values()))
+    shares = beside.get("controller_gain_error")
+    controller = nominal.controller if shares is None else with_gains(nominal.controller, list(shares.values()))
     rows = []
     for r, view, gap, blocks in zip(believed, views, gaps, builder.parts, strict=True):
         columns = answered(np.concatenate(blocks, axis=1), view, nominal, controller)

@@ -115,9 +115,8 @@ def _friction_shape(nominal: Nominal, views: Sequence[View], builder: Builder) -
         terms.append(_term("", builder.add(bent), math.sqrt(stiffness * nominal.inertia_kg_m2)))
     bend_nm = _unmeasured_nm(nominal)
     if bend_nm != 0.0:
-        terms.append(
-            _term("", builder.add([(v.slip * bend_nm - _above(nominal, v, bend_nm))[:, None] for v in views]), 1.0)
-        )
+        below = [(bend_nm * v.slip - _above(nominal, v, bend_nm))[:, None] for v in views]
+        terms.append(_term("", builder.add(below), 1.0))
     return terms
 
 

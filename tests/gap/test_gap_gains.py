@@ -17,6 +17,7 @@ from frictid_hil.gap.experiment_set import GAINS, Controller
 from frictid_hil.gap.findings import Finding
 from frictid_hil.gap.forward import Simulation
 from frictid_hil.gap.verdict import Verdict
+from frictid_hil.simulation.effects import all_effects
 
 PID = gap_sets.NOMINAL.controller
 assert PID is not None
@@ -58,8 +59,17 @@ def test_behind_a_coarse_encoder_the_joint_is_read_under_the_true_gains() -> Non
     assert gravity.value == pytest.approx(0.1, abs=0.03)
 
 
-def test_gains_are_named_once() -> None:
-    assert [name.split("_")[0] for name in GAINS] == [name.split("_")[0] for name in SHARES]
+def test_the_effects_shares_come_in_the_order_of_the_gains() -> None:
+    form = all_effects()["controller_gain_error"].demand
+    assert form is not None
+    assert [name.split("_")[0] for name in GAINS] == [name.split("_")[0] for name in form.parameters]
+
+
+def test_a_set_of_validation_logs_alone_is_answered_under_a_cascade() -> None:
+    nominal = replace(gap_sets.NOMINAL, controller=CASCADE)
+    made = gap_sets.make({}, nominal, only=("sines_repeat",))
+    assert all(e.validation for e in made.experiments)
+    assert diagnose(made).verdict == "none"
 
 
 @pytest.mark.parametrize(("gain", "guessed", "first"), [(2.0, False, 1), (20.0, False, 0), (20.0, True, 1)])
