@@ -9,7 +9,7 @@ integrator are those of ``plant``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -122,8 +122,36 @@ _SIZES: dict[str, tuple[tuple[float, float], tuple[int, ...], tuple[float, float
 """Inertia, gear ratios and peak speed by class."""
 
 
+@dataclass(frozen=True, slots=True)
+class Deal:
+    """A joint that is held, and why it is not as believed."""
+
+    rng: np.random.Generator  # of its recordings
+    setting: Setting
+    base: Sequence[Run]  # of the joint as believed
+    reasons: Sequence[Contributor]
+    total: dict[str, float]  # what they change together by channel, in floors
+    floors: Mapping[str, float]  # what noise alone leaves by channel, N m
+    form: float  # what no number of the belief can say, in floors
+
+
 def draw_wide(index: int, seed: int, kind: str) -> Drawn:
-    """One case, the same from the same arguments; drawn anew where it is not held, or what is withheld not seen."""
+    """One case, the same from the same arguments."""
+    deal = _dealt(index, seed, kind)
+    logs = _recorded(deal.rng, deal.setting, *_applied(deal.setting, deal.reasons))
+    name = f"case_{index:03d}"
+    return _nominal(name, deal.setting), logs, _truth(name, kind, deal)
+
+
+def recorded_again(index: int, seed: int, kind: str, without: Collection[str] = ()) -> tuple[Row, ...]:
+    """The motions of a case recorded once more with other noise, its joint less some contributors by name."""
+    deal = _dealt(index, seed, kind)
+    kept = [one for one in deal.reasons if one.name not in without]
+    return _recorded(np.random.default_rng([seed, 405, index]), deal.setting, *_applied(deal.setting, kept))
+
+
+def _dealt(index: int, seed: int, kind: str) -> Deal:
+    """Drawn anew where the joint is not held, or what is withheld not seen."""
     for attempt in range(200):
         rng = np.random.default_rng([seed, 404, index, attempt])
         setting = _setting(rng)
@@ -144,11 +172,8 @@ def draw_wide(index: int, seed: int, kind: str) -> Drawn:
         if kind == "none":
             reasons = _shrunk(setting, base, reasons, floors)
         total = _size(setting, base, reasons, floors)
-        if total is None or not _as_wanted(kind, reasons, max(total.values())):
-            continue
-        logs = _recorded(rng, setting, *_applied(setting, reasons))
-        name = f"case_{index:03d}"
-        return _nominal(name, setting), logs, _truth(name, kind, setting, base, reasons, total, floors, form)
+        if total is not None and _as_wanted(kind, reasons, max(total.values())):
+            return Deal(rng, setting, base, reasons, total, floors, form)
     raise RuntimeError(f"no joint came up for case {index} of kind {kind}")
 
 
@@ -700,16 +725,8 @@ def _bare(p: Physics) -> Physics:
     return p._replace(rounding=0.0, rate_extra=0.0)
 
 
-def _truth(
-    name: str,
-    kind: str,
-    setting: Setting,
-    base: Sequence[Run],
-    reasons: Sequence[Contributor],
-    total: dict[str, float],
-    floors: Mapping[str, float],
-    form: float,
-) -> dict[str, Any]:
+def _truth(name: str, kind: str, deal: Deal) -> dict[str, Any]:
+    setting, reasons, form = deal.setting, deal.reasons, deal.form
     withheld = [r for r in reasons if r.role != "tolerance"]
     largest = max((r.alone for r in reasons), default=0.0)
     first = [r.name for r in reasons if r.alone >= SHARED * largest and r.alone >= PRESENT]
@@ -729,15 +746,15 @@ def _truth(
         ],
         "form": form,
         "controller": setting.controller,
-        "size_ratio": max(total.values()),
-        "floors_nm": dict(floors),
+        "size_ratio": max(deal.total.values()),
+        "floors_nm": dict(deal.floors),
         "contributors": [
             {
                 "name": r.name,
                 "role": r.role,
                 "size_alone": r.alone,
                 "by_channel": r.sizes,
-                "indistinguishable": _tied(setting, base, r, floors["inverse"]) if r.alone >= PRESENT else [],
+                "indistinguishable": _tied(setting, deal.base, r, deal.floors["inverse"]) if r.alone >= PRESENT else [],
             }
             for r in reasons
         ],

@@ -176,11 +176,7 @@ def _show_diagnosis(output: Output, result: Result) -> None:
     shares = [(region, region["share_of_gap"]) for region in result["where"]]
     where = [(r["region"], f"{100 * s:.0f} %", "█" * round(30 * s), r["description"]) for r, s in shares if s >= 0.005]
     output.table(("where", "share of gap", "", ""), where, ("where",))
-    gap = []
-    for name in ("inverse_nm", "forward_torque_nm", "forward_position_rad"):
-        row = [result["gap"][state][name] for state in ("before", "after", "noise_floor")]
-        gap.append((name, *("-" if value is None else f"{value:.4g}" for value in row)))
-    output.table(("on validation logs", "before", "after", "noise floor"), gap)
+    _print_gap(output, result["gap"])
     if asked := result.get("next_experiment"):
         output.out.print(f"record next ({asked['duration_s']:.0f} s): {asked['description']}")
     for subject, why in result["reasons"].items():
@@ -192,6 +188,24 @@ def _show_diagnosis(output: Output, result: Result) -> None:
     output.tell(result, "model", "report")
     if result.get("model_refused"):
         output.say(f"no model was written: {result['model_refused']}")
+
+
+def _print_gap(output: Output, gap: Result) -> None:
+    """How far it closes, and what the low-pass has taken away before."""
+    rows = []
+    for name, interval in gap["after_interval_95"].items():
+        before, after, floor = (gap[state][name] for state in ("before", "after", "noise_floor"))
+        told = ["-" if value is None else f"{value:.4g}" for value in (before, after, floor)]
+        if interval is not None:
+            told[1] += f" ({interval[0]:.4g} .. {interval[1]:.4g})"
+        rows.append((name, *told))
+    output.table(("on validation logs", "before", "after (95 % interval)", "noise floor"), rows)
+    if gap["raw"] is not None:
+        raw, high_hz = gap["raw"], gap["band"]["high_hz"]
+        output.out.print(
+            f"behind a low-pass at {high_hz:.3g} Hz; before it inverse_nm is {raw['inverse_nm']:.4g}, of which noise "
+            f"makes {raw['noise_floor']['inverse_nm']:.4g}"
+        )
 
 
 def _cause(cause: Result) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from frictid_hil.gap.command_timing import in_force, is_guessed
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw, Value
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import Finding, Sampled, either_way, findings, sampled, whole_draws
-from frictid_hil.gap.forward import Replay, Replayed, Simulation, settled_nm, why_not
+from frictid_hil.gap.forward import Replay, Replayed, Simulation, pooled, why_not
 from frictid_hil.gap.how_far import Closed, closed, held_out, simulated
 from frictid_hil.gap.kinematics import fit_kinematics
 from frictid_hil.gap.loop_channel import loop_channel
@@ -259,7 +259,7 @@ def _quiet_in_the_loop(
 ) -> bool:
     """Whether the simulated closed loop shows no gap, or none with what the belief may well be wrong by."""
     quiet_nm = _quiet_nm(gaps, simulation.noise_nm, negligible_nm)
-    if settled_nm(simulation.bare) <= quiet_nm:
+    if pooled(simulation.bare, "torque_nm") <= quiet_nm:
         return True
     tolerable = _tolerable(found, channels, gaps, negligible_nm)
     return bool(tolerable) and simulation.gap_nm(tolerable) <= quiet_nm
@@ -314,7 +314,7 @@ def _noise_nm(simulation: Simulation, gaps: Sequence[Closed]) -> float:
 
 def _loop(simulation: Simulation, gaps: Sequence[Closed], negligible_nm: float) -> Loop:
     """The closed loop on the logs a gap is told of, as it judges causes."""
-    return Loop(simulation.gap_nm, settled_nm(simulation.bare), _noise_nm(simulation, gaps), negligible_nm)
+    return Loop(simulation.gap_nm, pooled(simulation.bare, "torque_nm"), _noise_nm(simulation, gaps), negligible_nm)
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:
@@ -375,6 +375,7 @@ def _told(
         before=before,
         after=after,
         noise_floor=floor,
+        after_intervals=_intervals(gaps) if applied else {},
         per_log={
             log: {when: Figures(None, *simulated({log: run[log]})) for when, run in runs.items()} for log in bare or ()
         },
@@ -407,6 +408,12 @@ def _figures(
     floor = None if inverse is None else min(inverse.floor, inverse.before)
     still = None if tracking is None else min(tracking.floor, tracking.before)
     return Figures(ends[0], *forward["before"]), Figures(ends[1], *forward["after"]), Figures(floor, noise, still)
+
+
+def _intervals(gaps: Sequence[Closed]) -> dict[str, tuple[float, float]]:
+    """95 % intervals of what is left, by the name of the figure."""
+    told = {"plant": "inverse_nm", "tracking": "forward_position_rad"}
+    return {told[gap.channel]: (gap.low, gap.high) for gap in gaps if gap.channel in told}
 
 
 def _causes(said: Verdict, channels: Sequence[Sampled], gaps: Sequence[Closed]) -> tuple[Cause, ...]:

@@ -81,6 +81,8 @@ class Diagnosis:
     before: Figures  # gap of the nominal joint
     after: Figures  # gap with the causes added
     noise_floor: Figures  # what noise alone leaves
+    # 95 % intervals of figures of ``after``, for another recording of the same motions, where they are formed.
+    after_intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     per_log: Mapping[str, Mapping[str, Figures]] = field(default_factory=dict)  # before and after by validation log
     next_experiment: NextExperiment | None = None  # where the verdict is ambiguous
     # Why a figure is None, or what could not be concluded, by subject.
@@ -129,7 +131,14 @@ class Diagnosis:
             "gap": {
                 "before": _figures(self.before),
                 "after": _figures(self.after),
+                "after_interval_95": {
+                    name: list(self.after_intervals[name]) if name in self.after_intervals else None
+                    for name in _figures(self.after)
+                },
                 "noise_floor": _figures(self.noise_floor),
+                "raw": self.raw
+                and {"inverse_nm": self.raw.inverse_nm, "noise_floor": {"inverse_nm": self.raw.noise_floor_nm}},
+                "band": self.raw and {"low_hz": 0.0, "high_hz": self.raw.cutoff_hz},
                 "per_log": {
                     log: {when: _figures(f) for when, f in figures.items()} for log, figures in self.per_log.items()
                 },

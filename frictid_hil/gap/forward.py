@@ -224,15 +224,13 @@ class Simulation:
     def gap_nm(self, effects: Effects) -> float:
         """RMS of the torque gap with effects added, N m; infinite where no controller holds the joint."""
         with np.errstate(over="ignore", invalid="ignore"):
-            gap = settled_nm(self.replay(effects, validation=self.validation))
+            gap = pooled(self.replay(effects, validation=self.validation), "torque_nm")
         return gap if math.isfinite(gap) else math.inf
 
 
 def pooled(differences: Mapping[str, Replayed], part: str) -> float:
-    """RMS over all rows of the given logs of ``torque_nm`` or ``position_rad``."""
-    return rms(np.concatenate([getattr(d, part) for d in differences.values()]))
+    """RMS of ``torque_nm`` or ``position_rad`` from where each of the given logs has settled: what is compared.
 
-
-def settled_nm(differences: Mapping[str, Replayed]) -> float:
-    """RMS torque difference from where each recording has settled: what hypotheses are compared by."""
-    return rms(np.concatenate([d.torque_nm[d.settled :] for d in differences.values()]))
+    A log that was cut out of a motion starts with a spring and an integral that nobody knows.
+    """
+    return rms(np.concatenate([getattr(d, part)[d.settled :] for d in differences.values()]))

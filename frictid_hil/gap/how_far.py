@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, Rows
@@ -20,7 +22,9 @@ COLOUR = 2.0
 FEW = 40  # draws from which the interval of a gap is read: its ends are known to a tenth of its width
 APPEARED = 2.5
 """Rest of a validation log over that of the fitted ones from which something is in it that was not there before."""
-WINDOW_S = 1.0  # time over which such a rest is averaged to tell since when
+WINDOW_S = 1.0
+"""Time over which a rest is averaged, to tell since when it is there, and how far it would repeat: twice the memory of
+the slow noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +34,7 @@ class Closed:
     channel: str  # its name
     before: float  # RMS of the residual
     after: float  # RMS with the named causes taken off
-    low: float  # 95 % interval of ``after``
+    low: float  # 95 % interval of ``after``, for another recording of these motions or the causes' true numbers
     high: float
     floor: float  # RMS that noise alone leaves
     # (log, seconds) where something shows that no identification log holds; None where nothing does.
@@ -44,18 +48,31 @@ def closed(channel: Sampled, names: Collection[str]) -> Closed:
     constant = posterior.channel.level_free
     every = [coefficients(channel, draw) for draw in _without_generic(channel, names)]
     mean = np.mean(every, axis=0)
-    spread = [rms(_left(judged, theta, constant)) for theta in every]
-    low, high = np.quantile(spread, [0.025, 0.975])
-    after = rms(_left(judged, mean, constant))
+    left = _left(judged, mean, constant)
+    apart = [_left(judged, theta, constant) - left for theta in every]
+    after, half = rms(left), _half_width(left, apart, posterior.channel.step_s)
     return Closed(
         posterior.channel.name,
         rms(_left(judged, np.zeros_like(mean), constant)),
         after,
-        min(float(low), after),
-        max(float(high), after),
+        math.sqrt(max(0.0, after**2 - half)),
+        math.sqrt(after**2 + half),
         min(posterior.floor, COLOUR * posterior.channel.known_floor),
         _appeared(channel, mean),
     )
+
+
+def _half_width(left: Array, apart: Sequence[Array], step_s: float) -> float:
+    """Of the 95 % interval of the mean square of what is ``left``, shape (n,).
+
+    Draws are ``apart`` from it by as much as their mean may be off by itself, and another recording of these motions
+    differs from this one by what its parts differ by.
+    """
+    numbers = float(np.quantile([np.mean(made**2) for made in apart], 0.95))
+    parts = np.array_split(left**2, max(2, round(left.size * step_s / WINDOW_S)))
+    means = [float(np.mean(part)) for part in parts]
+    repeats = float(special.stdtrit(len(means) - 1, 0.975)) * float(np.std(means, ddof=1)) / math.sqrt(len(means))
+    return math.hypot(numbers, repeats)
 
 
 def _without_generic(channel: Sampled, names: Collection[str]) -> list[Draw]:
@@ -112,5 +129,5 @@ def held_out(channel: Sampled) -> dict[str, float]:
 
 
 def simulated(differences: Mapping[str, Replayed]) -> tuple[float, float]:
-    """(torque in N m, position in rad): RMS of the difference in closed loop over all rows of the given logs."""
+    """(torque in N m, position in rad): RMS of the difference in closed loop, from where each log has settled."""
     return pooled(differences, "torque_nm"), pooled(differences, "position_rad")

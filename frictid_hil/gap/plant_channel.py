@@ -150,7 +150,7 @@ def _raw(logs: Sequence[Recording], residuals: Sequence[Array], noises: Sequence
     white = [white_rms(t) for k in chosen if (t := logs[k].experiment.torque_nm) is not None]
     own = [differenced_rms(t) for k in chosen if (t := logs[k].experiment.rigid_body_torque_nm) is not None]
     noise = math.hypot(rms(np.concatenate([noises[k] for k in chosen])), rms(np.array(white)))
-    return gap, math.hypot(noise, rms(np.array(own))) if own else noise
+    return gap, min(gap, math.hypot(noise, rms(np.array(own)) if own else 0.0))
 
 
 def white_nm(logs: Sequence[Recording], low_pass: LowPass) -> float:

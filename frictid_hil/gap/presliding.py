@@ -17,7 +17,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
-from frictid_hil.gap.forward import Replay, settled_nm, why_not
+from frictid_hil.gap.forward import Replay, pooled, why_not
 from frictid_hil.gap.residuals import LowPass, Recording, presliding_state, recordings
 
 GRADUALLY = (
@@ -62,7 +62,7 @@ def _nearer_in_the_loop(experiments: ExperimentSet, form: Nominal) -> bool:
         return False
     both = (replace(experiments, nominal=nominal) for nominal in (experiments.nominal, form))
     with np.errstate(over="ignore", invalid="ignore"):
-        believed_nm, other_nm = (settled_nm(Replay(one)({})) for one in both)
+        believed_nm, other_nm = (pooled(Replay(one)({}), "torque_nm") for one in both)
     return other_nm**2 < CLEARLY * believed_nm**2
 
 

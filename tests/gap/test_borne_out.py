@@ -11,7 +11,7 @@ import pytest
 from frictid_hil.gap.borne_out import LITTLE, REFUTED, Loop, borne_out
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Finding
-from frictid_hil.gap.forward import Effects, Replay, settled_nm
+from frictid_hil.gap.forward import Effects, Replay, pooled
 from frictid_hil.gap.verdict import DOUBTED, READ_DIRECTLY, Verdict
 
 BACKLASH = {"gap_rad": 0.004, "contact_stiffness_nm_per_rad": 20000.0, "contact_relaxation_s": 0.004}
@@ -140,7 +140,7 @@ def test_play_leads_where_the_motion_told_half_of_it() -> None:
     replay = Replay(experiments)
 
     def gap_nm(effects: Effects) -> float:
-        return settled_nm(replay(effects, validation=True))
+        return pooled(replay(effects, validation=True), "torque_nm")
 
     half = cause("backlash", "plant", 0.99, **{**BACKLASH, "gap_rad": 0.5 * BACKLASH["gap_rad"]})
     wrong = cause("torque_constant_error", error_share=0.3)

@@ -11,7 +11,7 @@ import pytest
 
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import ExperimentSet
-from frictid_hil.gap.forward import Replay, pooled, settled_nm
+from frictid_hil.gap.forward import Replay, pooled
 from frictid_hil.gap.residuals import LowPass, recordings, rms
 
 SINGLES = {
@@ -202,7 +202,8 @@ def test_an_encoders_steps_make_about_what_sets_two_joints_with_other_counts_apa
     ]
     here = replay({}, validation=True)
     there = Replay(replace(healthy, nominal=nominal, experiments=tuple(elsewhere)))({}, validation=True)
-    apart_nm = settled_nm({n: replace(run, torque_nm=run.torque_nm - there[n].torque_nm) for n, run in here.items()})
+    apart = {n: replace(run, torque_nm=run.torque_nm - there[n].torque_nm) for n, run in here.items()}
+    apart_nm = pooled(apart, "torque_nm")
     assert made_nm[0] == 0.0 < 2.0 * made_nm[1] < made_nm[2]
     assert 1.0 < apart_nm / made_nm[2] < 2.0  # of two draws, the root of two
 
