@@ -28,6 +28,7 @@ EVEN = 0.5  # chance below which a cause is likelier not there
 SIDED = 0.75
 """Share of the chance on the side that is told, below which an error of the belief may as well be the other way round:
 it is no cause that could be told."""
+ALL_ALIKE = 1e-6  # share of a cause's power that is its own however alike others are: keeps the inverse finite
 SURE = 0.99  # most that is claimed: one world in a hundred is of a kind that nobody thought of
 UNTOLD = 0.8  # most that is claimed of a cause of which the recordings tell a size and no number
 
@@ -45,6 +46,7 @@ class Finding:
     parameters: Mapping[str, Value] = field(default_factory=dict)
     rivals: tuple[str, ...] = ()  # causes that stand in its place in other draws
     where: str = ""  # name of the channel in which it shows most
+    own: float = 1.0  # share of its size that no other causes of its draws could make, whatever their sizes
 
     def at_most(self, bound: float) -> Finding:
         """The same cause, no surer than this."""
@@ -59,6 +61,7 @@ class Sampled:
     draws: Sequence[Draw]  # samples
     # By cause, its size over the floor in every draw less what others take back, (draws,); 0 if not in.
     sizes: Mapping[str, Array]
+    own: Mapping[str, Array]  # by cause, that part of its size which no others of the draw could make, (draws,)
     # By cause, the sign of its coefficient, (draws,); 1 where it is no error of one believed number, and has no sides.
     signs: Mapping[str, Array]
     # By cause, one-sigma of what the forms of the others may have put on it, in the same unit.
@@ -77,8 +80,8 @@ def sampled(posterior: Posterior) -> Sampled:
     x = np.concatenate([log.x[log.told] - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
     draws = [plainest(posterior, draw, gram) for draw in posterior.draws(posterior.search(), DRAWS)]
-    made = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(5))
-    sizes, signs, blurs, believed, tolerated = made
+    made = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(6))
+    sizes, own, signs, blurs, believed, tolerated = made
     expected = 1.0 / math.sqrt(_ways(posterior, gram))
     sided = {term.effect for term in posterior.channel.nuisances if len(term.columns) == 1}
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
@@ -95,8 +98,10 @@ def sampled(posterior: Posterior) -> Sampled:
         causes = {name: part for name, part in parts.items() if name and not name.startswith(FAMILY)}
         # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
         unnamed = [parts[""]] if "" in parts else []
-        for effect, net, blur in zip(causes, *_net([*causes.values(), *unnamed], gram), strict=False):
+        told = _net([*causes.values(), *unnamed], gram)
+        for effect, net, apart, blur in zip(causes, *told, strict=False):
             sizes[effect][k] = net / posterior.floor
+            own[effect][k] = min(net, apart) / posterior.floor
             signs[effect][k] = np.sign(np.sum(causes[effect][1])) if effect in sided else 1.0
             blurs[effect][k] = blur / posterior.floor
         for effect, (within, whole) in posterior.believed(draw, np.diag(gram)).items():
@@ -105,7 +110,7 @@ def sampled(posterior: Posterior) -> Sampled:
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
     lent = {effect: expected * blur for effect, blur in blurs.items()}
-    return Sampled(posterior, draws, sizes, signs, blurs, lent, believed, tolerated, generic, explained, gram)
+    return Sampled(posterior, draws, sizes, own, signs, blurs, lent, believed, tolerated, generic, explained, gram)
 
 
 def _ways(posterior: Posterior, gram: Array) -> float:
@@ -120,14 +125,16 @@ def _ways(posterior: Posterior, gram: Array) -> float:
     return max(1.0, columns.size**2 / max(float(np.sum(correlations**2)), 1.0))
 
 
-def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array, Array]:
-    """(RMS of what each cause makes less what others take back, one-sigma of what their forms may have put on it).
+def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array, Array, Array]:
+    """(RMS of what each cause makes less what others take back, that no others could make, that their forms may have).
+
+    The last is a one-sigma.
 
     A pair that more than half cancels explains nothing. A cause that moves as a larger one does is told from it by
     their forms alone, and no joint is quite as its formula.
     """
     if not parts:
-        return np.zeros(0), np.zeros(0)
+        return np.zeros(0), np.zeros(0), np.zeros(0)
     vectors = np.stack([np.bincount(columns, values, gram.shape[0]) for columns, values in parts])
     inner = vectors @ gram @ vectors.T
     squares = np.maximum(np.diag(inner), 1e-300)
@@ -136,10 +143,11 @@ def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array,
     cancels = pair < CANCELS * np.maximum(squares[:, None], squares)
     taken_back = np.where(cancels, inner, 0.0).sum(axis=1) / own
     net: Array = np.maximum(0.0, own + taken_back)
-    apart = np.sqrt(np.maximum(1.0 - (inner / (own[:, None] * own)) ** 2, FORM**2))
-    lent = FORM * own / apart
+    alike = inner / (own[:, None] * own)
+    lent = FORM * own / np.sqrt(np.maximum(1.0 - alike**2, FORM**2))
     np.fill_diagonal(lent, 0.0)
-    return net, np.max(lent, axis=1, initial=0.0)
+    apart: Array = own / np.sqrt(np.diag(np.linalg.inv(alike + ALL_ALIKE * np.eye(own.size))))
+    return net, apart, np.max(lent, axis=1, initial=0.0)
 
 
 def findings(channels: Sequence[Sampled]) -> list[Finding]:
@@ -169,6 +177,7 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
                 values,
                 _rivals(row, names, there, shown),
                 home.posterior.channel.name,
+                rms(_over_channels("own", name, channels)) / rms(table[row]),
             )
         )
     return sorted(result, key=lambda f: -f.size)
