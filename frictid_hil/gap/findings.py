@@ -8,13 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numba import njit
 from scipy import special
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, STIFFNESS, Channel, Term
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.plainest import CANCELS, plainest
-from frictid_hil.gap.posterior import FORM, Draw, Posterior, by_term, joined
+from frictid_hil.gap.posterior import FORM, Draw, Posterior, by_term, form_of, joined
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -28,7 +29,7 @@ EVEN = 0.5  # chance below which a cause is likelier not there
 SIDED = 0.75
 """Share of the chance on the side that is told, below which an error of the belief may as well be the other way round:
 it is no cause that could be told."""
-ALL_ALIKE = 1e-6  # share of a cause's power that is its own however alike others are: keeps the inverse finite
+SWEEPS = 30  # of a descent, each over all causes of a draw
 SURE = 0.99  # most that is claimed: one world in a hundred is of a kind that nobody thought of
 UNTOLD = 0.8  # most that is claimed of a cause of which the recordings tell a size and no number
 
@@ -46,7 +47,7 @@ class Finding:
     parameters: Mapping[str, Value] = field(default_factory=dict)
     rivals: tuple[str, ...] = ()  # causes that stand in its place in other draws
     where: str = ""  # name of the channel in which it shows most
-    own: float = 1.0  # share of its size that no other causes of its draws could make, whatever their sizes
+    own: float = 1.0  # share of its size that no others of its draws could make, each changed by up to its own size
 
     def at_most(self, bound: float) -> Finding:
         """The same cause, no surer than this."""
@@ -61,7 +62,7 @@ class Sampled:
     draws: Sequence[Draw]  # samples
     # By cause, its size over the floor in every draw less what others take back, (draws,); 0 if not in.
     sizes: Mapping[str, Array]
-    own: Mapping[str, Array]  # by cause, that part of its size which no others of the draw could make, (draws,)
+    own: Mapping[str, Array]  # by cause, that part of its size which others of the draw could not make, (draws,)
     # By cause, the sign of its coefficient, (draws,); 1 where it is no error of one believed number, and has no sides.
     signs: Mapping[str, Array]
     # By cause, one-sigma of what the forms of the others may have put on it, in the same unit.
@@ -97,8 +98,8 @@ def sampled(posterior: Posterior) -> Sampled:
         parts = posterior.contributions(draw)
         causes = {name: part for name, part in parts.items() if name and not name.startswith(FAMILY)}
         # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
-        unnamed = [parts[""]] if "" in parts else []
-        told = _net([*causes.values(), *unnamed], gram)
+        named = {**causes, **({"": parts[""]} if "" in parts else {})}
+        told = _net(list(named.values()), np.array([form_of(name) for name in named]), gram)
         for effect, net, apart, blur in zip(causes, *told, strict=False):
             sizes[effect][k] = net / posterior.floor
             own[effect][k] = min(net, apart) / posterior.floor
@@ -125,10 +126,10 @@ def _ways(posterior: Posterior, gram: Array) -> float:
     return max(1.0, columns.size**2 / max(float(np.sum(correlations**2)), 1.0))
 
 
-def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array, Array, Array]:
+def _net(parts: Sequence[tuple[np.ndarray, Array]], forms: Array, gram: Array) -> tuple[Array, Array, Array]:
     """(RMS of what each cause makes less what others take back, that no others could make, that their forms may have).
 
-    The last is a one-sigma.
+    The last is a one-sigma; ``forms`` are those of each cause, over its size.
 
     A pair that more than half cancels explains nothing. A cause that moves as a larger one does is told from it by
     their forms alone, and no joint is quite as its formula.
@@ -144,10 +145,29 @@ def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array,
     taken_back = np.where(cancels, inner, 0.0).sum(axis=1) / own
     net: Array = np.maximum(0.0, own + taken_back)
     alike = inner / (own[:, None] * own)
-    lent = FORM * own / np.sqrt(np.maximum(1.0 - alike**2, FORM**2))
+    lent = forms * own / np.sqrt(np.maximum(1.0 - alike**2, FORM**2))
     np.fill_diagonal(lent, 0.0)
-    apart: Array = own / np.sqrt(np.diag(np.linalg.inv(alike + ALL_ALIKE * np.eye(own.size))))
-    return net, apart, np.max(lent, axis=1, initial=0.0)
+    return net, _apart(inner), np.max(lent, axis=1, initial=0.0)
+
+
+@njit(cache=True)
+def _apart(inner: Array) -> Array:
+    """What is left of each cause at least when all others change by up to their sizes, shape (n,).
+
+    ``inner`` holds mean products of what they make, shape (n, n); a descent from one coordinate to the next.
+    """
+    count = inner.shape[0]
+    left = np.zeros(count)
+    for one in range(count):
+        change = np.zeros(count)
+        for _ in range(SWEEPS):
+            for other in range(count):
+                if other != one and inner[other, other] > 0.0:
+                    wanted = inner[other, one] - inner[other] @ change + inner[other, other] * change[other]
+                    change[other] = min(1.0, max(-1.0, wanted / inner[other, other]))
+        change[one] = -1.0
+        left[one] = math.sqrt(max(0.0, float(change @ inner @ change)))
+    return left
 
 
 def findings(channels: Sequence[Sampled]) -> list[Finding]:
@@ -294,7 +314,7 @@ def _values(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
 def _lent(effect: str, channels: Sequence[Sampled]) -> Array:
     """Factors by which a cause's numbers may be off because no joint is quite as its formula, one a draw, (draws,)."""
     size, blur = (rms(_over_channels(what, effect, channels)) for what in ("sizes", "blurs"))
-    spread = math.hypot(FORM, blur / max(size, FORM * VISIBLE))
+    spread = math.hypot(form_of(effect), blur / max(size, FORM * VISIBLE))
     normal = special.ndtri((np.arange(DRAWS) + 0.5) / DRAWS)
     factors: Array = 1.0 + spread * np.random.default_rng(0).permutation(normal)
     return factors

@@ -22,6 +22,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap import noise
 from frictid_hil.gap.channel import FAMILY, Channel, Term
 from frictid_hil.gap.residuals import rms
+from frictid_hil.simulation.effects import all_effects
 
 SLOW = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)  # variance of the slow part over that of the noise: half decades
 MEMORY_S = (0.1, 0.5)  # its time constants: a reversal, a move
@@ -34,6 +35,8 @@ REDRAWN = 20  # times that a draw outside of its bounds is drawn anew before it 
 STRETCHES = 6  # parts of the recordings that are left out one by one, at least
 FORM = 0.1
 """One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
+RIGID = 0.02
+"""The same where the mechanics of a rigid link give the form: links bend, and cables pull, by a few hundredths."""
 MOST_DOUBT = 3.0
 """Variance that forms may lend to what tells causes apart, at most: more of it shows in the noise itself."""
 ROUNDING = 1e-12  # share of a matrix' largest entry that rounding may leave in the others
@@ -42,6 +45,12 @@ SURE = 5.0
 shapes may be shared by them."""
 UNNAMED = FAMILY + "rest"  # what a draw holds besides its terms
 POINTS = 4  # points of the grid, the likeliest, at which all candidates are compared
+
+
+def form_of(effect: str) -> float:
+    """One-sigma of what a cause makes beyond its form, over its size."""
+    known = all_effects().get(effect)
+    return RIGID if known is not None and known.rigid else FORM
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,10 +310,13 @@ class Posterior:
     def _lent(self, model: Model) -> float:
         """Variance of what tells a model from its rivals, over that of the noise, as its causes are off their forms.
 
-        What a model explains of the recordings it explains up to the square of ``FORM``; that rest may lie just where
-        a rival is better.
+        What a cause explains of the recordings it explains up to the square of how far it may be off its form; that
+        rest may lie just where a rival is better.
         """
-        return min(MOST_DOUBT, 1.0 + FORM**2 * (model.score - self.model(()).score))
+        candidates = self.channel.candidates
+        rigid = self.model([t for t in model.terms if form_of(candidates[t].effect) == RIGID]).score
+        lent = FORM**2 * (model.score - rigid) + RIGID**2 * (rigid - self.model(()).score)
+        return min(MOST_DOUBT, 1.0 + max(0.0, lent))
 
     def _surprise(self, model: Model) -> float:
         """Mean square of what a model leaves of stretches left out one by one, over what it itself expects of them.
