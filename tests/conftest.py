@@ -8,6 +8,7 @@ import tempfile
 import threading
 from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is loaded
@@ -27,3 +28,61 @@ settings.load_profile("patient")
 settings.register_profile(
     "fast", settings.get_profile("patient"), max_examples=20
 )  # the developer's loop; the whole check draws as many as tests say
+
+SAMPLED = {  # function: the parameters that the whole check takes; ``--long`` takes them all
+    "test_calibrated_behind_anothers_canopen": {"copley", "zeroerr"},
+    "test_tshark_finds_no_malformed_frame": {"copley", "zeroerr"},
+    "test_a_unit_is_found_and_its_interval_covers_it": {
+        *("0-copley", "6-nanotec", "10-damiao", "13-cybergear", "16-feetech-scs", "17-dynamixel"),
+    },
+    "test_checked_calibrated_and_compensated": {"copley", "eyou", "synapticon"},
+    "test_every_refusal_of_a_strict_drive_is_foreseen": {"elmo", "epos4", "nanotec", "synapticon"},
+    "test_compensation_follows_better_than_none": {"damiao", "robstride"},
+    "test_a_servo_that_no_word_reaches_is_judged_by_where_it_is": {
+        *("feetech calibrate-hold-send value", "feetech compensate-track mop-servo silent"),
+    },
+    "test_a_healthy_servo_of_two_speeds_is_within_its_interval": {"feetech calibrate"},
+    "test_every_effect_is_named": {
+        *("encoder_offset", "joint_elasticity", "load_dependent_friction", "stribeck", "torque_delay", "torque_ripple"),
+    },
+    "test_no_gap_is_reported_that_is_larger_than_the_logs_contain": {"healthy", "joint_elasticity"},
+    "test_traces_that_are_real_but_drown_in_noise_are_no_cause": {"1"},
+    "test_nine_of_ten_knots_are_covered_and_the_intervals_are_not_useless": {
+        *("indices0-aligned", "indices1-function-a", "indices1-least-squares"),
+    },
+    "test_a_rigid_joint_has_no_link_in_short_programmes_or_at_250_hz": {"quick-0.004", "standard-0.001"},
+    "test_six_joints_streaming_at_921600_are_within_the_bar": {"1", "5"},
+    "test_a_job_whose_port_comes_back_is_fetched_to_its_end": {"0.4"},
+    "test_twice_stops_quickly": {"2-15"},
+    "test_an_effect_is_recorded_named_and_closed": {"torque_bias"},
+}
+LONG = {  # functions that ``--long`` alone runs: what they show is shown by others in a smaller way
+    "test_behind_another_authors_canopen_on_that_link",
+    "test_can_fd_carries_them_faster_and_its_log_replays",
+    "test_can_fd_changes_no_figure",
+    "test_a_round_of_the_soak_keeps_nothing",
+    "test_an_error_of_the_belief_that_makes_four_floors_in_the_loop_is_named_small_as_it_is_along_the_motion",
+    "test_what_was_left_out_is_told_with_its_reason",
+    "test_friction_is_found_over_it",
+    "test_on_the_wall_clock_it_reaches_the_same",
+}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--long", action="store_true", help="run every proof, also those that the whole check samples")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Without ``--long``, many proofs of one kind are a sample of them."""
+    left_out = [] if config.getoption("--long") else [item for item in items if _is_long(item)]
+    if items and len(left_out) == len(items):
+        raise pytest.UsageError("these tests are no part of the whole check's sample: add --long")
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
+
+
+def _is_long(item: pytest.Item) -> bool:
+    name, _, parameters = item.name.partition("[")
+    sample = SAMPLED.get(name)
+    return name in LONG or (sample is not None and parameters.removesuffix("]") not in sample)

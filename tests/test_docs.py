@@ -131,3 +131,12 @@ def test_every_finding_names_tests_that_exist(name: str) -> None:
         if not path.exists() or (test and f"def {test}(" not in path.read_text(encoding="utf-8")):
             missing.append(f"{file}::{test}")
     assert len(named) > 30 and missing == []
+
+
+def test_every_proof_that_is_sampled_is_there() -> None:
+    listed = re.search(r"SAMPLED = .*?\n}\n", (ROOT / "tests" / "conftest.py").read_text(), flags=re.DOTALL)
+    long = re.search(r"LONG = .*?\n}\n", (ROOT / "tests" / "conftest.py").read_text(), flags=re.DOTALL)
+    assert listed is not None and long is not None
+    names = re.findall(r'^    "(test_\w+)"', listed[0] + long[0], flags=re.MULTILINE)
+    written = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+    assert len(names) > 10 and [name for name in names if f"def {name}(" not in written] == []

@@ -65,13 +65,13 @@ def closed(channel: Sampled, names: Collection[str]) -> Closed:
 def _half_width(left: Array, apart: Sequence[Array], step_s: float) -> float:
     """Of the 95 % interval of the mean square of what is ``left``, shape (n,).
 
-    Draws are ``apart`` from it by as much as their mean may be off by itself, and another recording of these motions
-    differs from this one by what its parts differ by.
+    Draws are ``apart`` from it by as much as their mean may be off by itself. Another recording of these motions is as
+    far from what is expected as this one, and both are so by what their parts differ by.
     """
     numbers = float(np.quantile([np.mean(made**2) for made in apart], 0.95))
     parts = np.array_split(left**2, max(2, round(left.size * step_s / WINDOW_S)))
     means = [float(np.mean(part)) for part in parts]
-    repeats = float(special.stdtrit(len(means) - 1, 0.975)) * float(np.std(means, ddof=1)) / math.sqrt(len(means))
+    repeats = float(special.stdtrit(len(means) - 1, 0.975)) * float(np.std(means, ddof=1)) * math.sqrt(2 / len(means))
     return math.hypot(numbers, repeats)
 
 

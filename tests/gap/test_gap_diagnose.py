@@ -166,7 +166,17 @@ def test_json_is_plain_and_shares_add_up(healthy: ExperimentSet) -> None:
     d = diagnose(gap_sets.make({"direction_asymmetry": SINGLES["direction_asymmetry"]}))
     document = json.loads(json.dumps(d.to_json()))
     assert set(document["gap"]) >= {"before", "after", "noise_floor"}
-    assert set(document["gap"]["before"]) == {"inverse_nm", "forward_torque_nm", "forward_position_rad"}
+    gap = document["gap"]
+    assert (
+        set(gap["before"])
+        == set(gap["after_interval_95"])
+        == {*("inverse_nm", "forward_torque_nm", "forward_position_rad")}
+    )
+    low, high = gap["after_interval_95"]["inverse_nm"]
+    assert low < gap["after"]["inverse_nm"] < high < 0.5 * gap["before"]["inverse_nm"]
+    assert gap["band"] == {"low_hz": 0.0, "high_hz": 20.0}
+    assert gap["raw"]["inverse_nm"] > gap["before"]["inverse_nm"]  # a low-pass only takes away
+    assert gap["raw"]["noise_floor"]["inverse_nm"] <= gap["raw"]["inverse_nm"]
     assert sum(w["share_of_gap"] for w in document["where"]) == pytest.approx(1.0)
     assert document["causes"][0]["parameters"]["coulomb_share"]["interval_95"] is not None
 

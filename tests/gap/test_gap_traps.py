@@ -22,6 +22,7 @@ from frictid_hil.simulation.replay import Controller as Loop
 from frictid_hil.simulation.replay import closed_loop
 
 PRESLIDING = {"presliding_hysteresis": {"share": 0.5, "distance_rad": 0.02}}
+SPRING_RAD = 3.03 / 20000.0  # friction at the start over its stiffness, of the sets that are made here
 WITHOUT_LOOP = [pytest.param(False, id="no controller"), pytest.param(True, id="closed loop")]
 
 
@@ -62,7 +63,10 @@ def _loop(c: Controller) -> Loop:
 
 
 def _torque_in_the_logs(experiments: ExperimentSet, model: JointModel) -> float:
-    """RMS between recorded and simulated torque over the validation logs, formed here without the diagnosis."""
+    """RMS between recorded and simulated torque over the validation logs, formed here without the diagnosis.
+
+    From 0.3 s after the joint has left its first place by three times what its friction's spring bends.
+    """
     assert experiments.nominal.controller is not None
     loop, state, parts = _loop(experiments.nominal.controller), None, []
     for e in experiments.experiments:
@@ -71,7 +75,9 @@ def _torque_in_the_logs(experiments: ExperimentSet, model: JointModel) -> float:
         state = rows.state
         b, a = signal.butter(4, 20.0 / (0.5 / gap_sets.STEP_S))
         if e.validation:
-            parts.append(signal.filtfilt(b, a, e.torque_nm - rows.torque_nm, padlen=15))
+            moved = np.abs(e.position_rad - e.position_rad[0]) > 3.0 * SPRING_RAD
+            settled = int(np.argmax(moved)) + round(0.3 / gap_sets.STEP_S)
+            parts.append(signal.filtfilt(b, a, e.torque_nm - rows.torque_nm, padlen=15)[settled:])
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
 

@@ -1,0 +1,63 @@
+"""How far a gap closes: the interval of what is left, and the figures of the closed loop."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from frictid_hil.gap.findings import _apart
+from frictid_hil.gap.forward import Replayed, pooled
+from frictid_hil.gap.how_far import _half_width
+
+STEP_S = 0.02
+TRUE = np.array([0.4, 1.0])  # coefficients of what is left and of what a cause makes, N m
+
+
+def _recorded(random: np.random.Generator, x: np.ndarray) -> np.ndarray:
+    """A residual whose noise remembers for 0.1 s."""
+    white = random.standard_normal(x.shape[0] + 1)
+    return x @ TRUE + 0.3 * (0.8 * white[1:] + 0.6 * white[:-1])
+
+
+def test_the_interval_holds_another_recording_and_the_true_numbers_in_nine_of_ten() -> None:
+    """A cause is fitted to one recording and judged on a second; a third one is to come."""
+    random = np.random.default_rng(3)
+    again, true = [], []
+    for _ in range(300):
+        x = np.stack([np.sin(np.arange(1000) * 0.11), np.sign(np.sin(np.arange(1000) * 0.05))], axis=1)
+        cause = x[:, 1:]
+        covariance = np.linalg.inv(cause.T @ cause) * (0.3**2 * 2.0 + 0.5 * TRUE[0] ** 2)
+        fitted = np.linalg.lstsq(cause, _recorded(random, x), rcond=None)[0]
+        draws = fitted + random.standard_normal((40, 1)) * np.sqrt(covariance)
+        left = _recorded(random, x) - cause @ fitted
+        half = _half_width(left, [cause @ (fitted - draw) for draw in draws], STEP_S)
+        low, high = np.sqrt(np.mean(left**2) - half), np.sqrt(np.mean(left**2) + half)
+        other = _recorded(random, x)
+        again.append(low <= np.sqrt(np.mean((other - cause @ fitted) ** 2)) <= high)
+        true.append(low <= np.sqrt(np.mean((other - cause @ TRUE[1:]) ** 2)) <= high)
+        assert high < 1.4 * low  # it says something
+    assert min(np.mean(again), np.mean(true)) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("others", "left"),
+    [
+        ([], 1.0),
+        ([[0.0, 3.0]], 1.0),  # square to it
+        ([[-5.0, 0.0]], 0.0),  # makes all of it
+        ([[0.3, 0.0]], 0.7),  # makes it, and is smaller
+        ([[0.3, 0.0], [-0.2, 0.0]], 0.5),
+        ([[2.0, 2.0]], math.sqrt(0.5)),  # at 45 degrees
+    ],
+)
+def test_what_others_could_not_make_is_a_causes_own(others: list[list[float]], left: float) -> None:
+    vectors = np.array([[1.0, 0.0], *others])
+    assert _apart(vectors @ vectors.T)[0] == pytest.approx(left, abs=1e-6)
+
+
+def test_a_closed_loop_is_told_from_where_a_log_has_settled() -> None:
+    start, rest = np.full(50, 9.0), np.full(150, 2.0)
+    log = Replayed(np.concatenate([start, rest]), np.concatenate([start, 0.5 * rest]), settled=50)
+    assert (pooled({"moves": log}, "torque_nm"), pooled({"moves": log}, "position_rad")) == (2.0, 1.0)
