@@ -304,7 +304,7 @@ def _ranked(said: Verdict, simulation: Simulation, gaps: Sequence[Closed], *, gu
     made_nm = simulation.made_nm([_values([f]) for f in said.named])
     for f, made in zip(said.named, made_nm, strict=True):
         sizes[f.effect] = max(sizes[f.effect], math.sqrt(f.chance) * made / noise_nm)
-    return replace(said, named=tuple(sorted(said.named, key=lambda f: -f.own * sizes[f.effect])))
+    return replace(said, named=tuple(sorted(said.named, key=lambda f: -sizes[f.effect])))
 
 
 def _noise_nm(simulation: Simulation, gaps: Sequence[Closed]) -> float:

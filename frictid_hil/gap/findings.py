@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numba import njit
 from scipy import special
 
 from frictid_hil.friction.trajectory import Array
@@ -29,7 +28,6 @@ EVEN = 0.5  # chance below which a cause is likelier not there
 SIDED = 0.75
 """Share of the chance on the side that is told, below which an error of the belief may as well be the other way round:
 it is no cause that could be told."""
-SWEEPS = 30  # of a descent, each over all causes of a draw
 SURE = 0.99  # most that is claimed: one world in a hundred is of a kind that nobody thought of
 UNTOLD = 0.8  # most that is claimed of a cause of which the recordings tell a size and no number
 
@@ -47,7 +45,6 @@ class Finding:
     parameters: Mapping[str, Value] = field(default_factory=dict)
     rivals: tuple[str, ...] = ()  # causes that stand in its place in other draws
     where: str = ""  # name of the channel in which it shows most
-    own: float = 1.0  # share of its size that no others of its draws could make, each changed by up to its own size
 
     def at_most(self, bound: float) -> Finding:
         """The same cause, no surer than this."""
@@ -62,7 +59,6 @@ class Sampled:
     draws: Sequence[Draw]  # samples
     # By cause, its size over the floor in every draw less what others take back, (draws,); 0 if not in.
     sizes: Mapping[str, Array]
-    own: Mapping[str, Array]  # by cause, that part of its size which others of the draw could not make, (draws,)
     # By cause, the sign of its coefficient, (draws,); 1 where it is no error of one believed number, and has no sides.
     signs: Mapping[str, Array]
     # By cause, one-sigma of what the forms of the others may have put on it, in the same unit.
@@ -81,8 +77,8 @@ def sampled(posterior: Posterior) -> Sampled:
     x = np.concatenate([log.x[log.told] - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
     draws = [plainest(posterior, draw, gram) for draw in posterior.draws(posterior.search(), DRAWS)]
-    made = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(6))
-    sizes, own, signs, blurs, believed, tolerated = made
+    made = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(5))
+    sizes, signs, blurs, believed, tolerated = made
     expected = 1.0 / math.sqrt(_ways(posterior, gram))
     sided = {term.effect for term in posterior.channel.nuisances if len(term.columns) == 1}
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
@@ -100,9 +96,8 @@ def sampled(posterior: Posterior) -> Sampled:
         # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
         named = {**causes, **({"": parts[""]} if "" in parts else {})}
         told = _net(list(named.values()), np.array([form_of(name) for name in named]), gram)
-        for effect, net, apart, blur in zip(causes, *told, strict=False):
+        for effect, net, blur in zip(causes, *told, strict=False):
             sizes[effect][k] = net / posterior.floor
-            own[effect][k] = min(net, apart) / posterior.floor
             signs[effect][k] = np.sign(np.sum(causes[effect][1])) if effect in sided else 1.0
             blurs[effect][k] = blur / posterior.floor
         for effect, (within, whole) in posterior.believed(draw, np.diag(gram)).items():
@@ -111,7 +106,7 @@ def sampled(posterior: Posterior) -> Sampled:
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
     lent = {effect: expected * blur for effect, blur in blurs.items()}
-    return Sampled(posterior, draws, sizes, own, signs, blurs, lent, believed, tolerated, generic, explained, gram)
+    return Sampled(posterior, draws, sizes, signs, blurs, lent, believed, tolerated, generic, explained, gram)
 
 
 def _ways(posterior: Posterior, gram: Array) -> float:
@@ -126,16 +121,16 @@ def _ways(posterior: Posterior, gram: Array) -> float:
     return max(1.0, columns.size**2 / max(float(np.sum(correlations**2)), 1.0))
 
 
-def _net(parts: Sequence[tuple[np.ndarray, Array]], forms: Array, gram: Array) -> tuple[Array, Array, Array]:
-    """(RMS of what each cause makes less what others take back, that no others could make, that their forms may have).
+def _net(parts: Sequence[tuple[np.ndarray, Array]], forms: Array, gram: Array) -> tuple[Array, Array]:
+    """(RMS of what each cause makes less what others take back, one-sigma of what their forms may have put on it).
 
-    The last is a one-sigma; ``forms`` are those of each cause, over its size.
+    ``forms`` is how far each may be off its form, over its size.
 
     A pair that more than half cancels explains nothing. A cause that moves as a larger one does is told from it by
     their forms alone, and no joint is quite as its formula.
     """
     if not parts:
-        return np.zeros(0), np.zeros(0), np.zeros(0)
+        return np.zeros(0), np.zeros(0)
     vectors = np.stack([np.bincount(columns, values, gram.shape[0]) for columns, values in parts])
     inner = vectors @ gram @ vectors.T
     squares = np.maximum(np.diag(inner), 1e-300)
@@ -147,27 +142,7 @@ def _net(parts: Sequence[tuple[np.ndarray, Array]], forms: Array, gram: Array) -
     alike = inner / (own[:, None] * own)
     lent = forms * own / np.sqrt(np.maximum(1.0 - alike**2, FORM**2))
     np.fill_diagonal(lent, 0.0)
-    return net, _apart(inner), np.max(lent, axis=1, initial=0.0)
-
-
-@njit(cache=True)
-def _apart(inner: Array) -> Array:
-    """What is left of each cause at least when all others change by up to their sizes, shape (n,).
-
-    ``inner`` holds mean products of what they make, shape (n, n); a descent from one coordinate to the next.
-    """
-    count = inner.shape[0]
-    left = np.zeros(count)
-    for one in range(count):
-        change = np.zeros(count)
-        for _ in range(SWEEPS):
-            for other in range(count):
-                if other != one and inner[other, other] > 0.0:
-                    wanted = inner[other, one] - inner[other] @ change + inner[other, other] * change[other]
-                    change[other] = min(1.0, max(-1.0, wanted / inner[other, other]))
-        change[one] = -1.0
-        left[one] = math.sqrt(max(0.0, float(change @ inner @ change)))
-    return left
+    return net, np.max(lent, axis=1, initial=0.0)
 
 
 def findings(channels: Sequence[Sampled]) -> list[Finding]:
@@ -197,7 +172,6 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
                 values,
                 _rivals(row, names, there, shown),
                 home.posterior.channel.name,
-                rms(_over_channels("own", name, channels)) / rms(table[row]),
             )
         )
     return sorted(result, key=lambda f: -f.size)

@@ -46,7 +46,7 @@ def channel(name: str, cause: str, size: float, signs: np.ndarray, *, between_ro
 
     sizes = each(size)
     return Sampled(
-        posterior, draws, sizes, sizes, {cause: signs}, each(0.1), each(0.1), each(10.0), each(10.0),
+        posterior, draws, sizes, {cause: signs}, each(0.1), each(0.1), each(10.0), each(10.0),
         np.zeros(DRAWS), sizes[cause], np.ones((1, 1)),
     )  # fmt: skip
 

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-import pytest
 
-from frictid_hil.gap.findings import _apart
 from frictid_hil.gap.forward import Replayed, pooled
 from frictid_hil.gap.how_far import _half_width
 
@@ -39,22 +35,6 @@ def test_the_interval_holds_another_recording_and_the_true_numbers_in_nine_of_te
         true.append(low <= np.sqrt(np.mean((other - cause @ TRUE[1:]) ** 2)) <= high)
         assert high < 1.4 * low  # it says something
     assert min(np.mean(again), np.mean(true)) > 0.9
-
-
-@pytest.mark.parametrize(
-    ("others", "left"),
-    [
-        ([], 1.0),
-        ([[0.0, 3.0]], 1.0),  # square to it
-        ([[-5.0, 0.0]], 0.0),  # makes all of it
-        ([[0.3, 0.0]], 0.7),  # makes it, and is smaller
-        ([[0.3, 0.0], [-0.2, 0.0]], 0.5),
-        ([[2.0, 2.0]], math.sqrt(0.5)),  # at 45 degrees
-    ],
-)
-def test_what_others_could_not_make_is_a_causes_own(others: list[list[float]], left: float) -> None:
-    vectors = np.array([[1.0, 0.0], *others])
-    assert _apart(vectors @ vectors.T)[0] == pytest.approx(left, abs=1e-6)
 
 
 def test_a_closed_loop_is_told_from_where_a_log_has_settled() -> None:
