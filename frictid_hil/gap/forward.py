@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -93,6 +93,13 @@ def bounded(name: str, values: Mapping[str, float]) -> dict[str, float]:
     return {k: float(np.clip(v, limits[k].lower, limits[k].upper)) for k, v in values.items() if k in limits}
 
 
+_Key = tuple[tuple[str, tuple[tuple[str, float], ...]], ...]
+
+
+def _key(effects: Effects) -> _Key:
+    return tuple((name, tuple(sorted(values.items()))) for name, values in sorted(effects.items()))
+
+
 class Replay:
     """Replays of one experiment set; the nominal model may carry any effects."""
 
@@ -106,6 +113,7 @@ class Replay:
         assert controller is not None
         told = {field.name: getattr(controller, field.name) for field in fields(Controller)}
         self._controller = Controller(**told)
+        self._held: dict[_Key, dict[str, Replayed]] = {}
 
     def recorded(self) -> tuple[Experiment, ...]:
         """The believed joint itself, recorded as the set was, its encoder and its drive rounding nothing."""
@@ -129,15 +137,21 @@ class Replay:
     def __call__(self, effects: Effects, *, validation: bool | None = None) -> dict[str, Replayed]:
         """Differences by experiment name, of validation logs only, of the others only, or of all (None).
 
-        Warmth carries over in run order, so earlier logs are simulated too where an effect remembers.
+        Warmth carries over in run order, so earlier logs are simulated too where an effect remembers. What was replayed
+        once is held.
         """
-        carried = any(all_effects()[name].carried for name in effects)
-        return self._replayed(self.model(effects), carried, validation)
+        wanted = [e.name for e in self._experiments if validation is None or e.validation == validation]
+        held = self._held.setdefault(_key(effects), {})
+        if missing := [name for name in wanted if name not in held]:
+            carried = any(all_effects()[name].carried for name in effects)
+            held |= self._replayed(self.model(effects), carried, missing)
+        return {name: held[name] for name in wanted}
 
     def without_steps(self) -> Replay:
         """The same replays with an encoder that rounds nothing."""
         other = copy.copy(self)
         other._nominal = replace(self._nominal, encoder=replace(self._nominal.encoder, counts_per_revolution=0.0))
+        other._held = {}
         return other
 
     def steps_nm(self, bare: Mapping[str, Replayed], validation: bool | None) -> float:
@@ -151,16 +165,12 @@ class Replay:
         apart = [(bare[n].torque_nm - run.torque_nm)[run.settled :] for n, run in smooth.items()]
         return rms(np.concatenate(apart))
 
-    def _replayed(self, model: JointModel, carried: bool, validation: bool | None) -> dict[str, Replayed]:
+    def _replayed(self, model: JointModel, carried: bool, wanted: Collection[str]) -> dict[str, Replayed]:
         state: CarryOver | None = None
         result: dict[str, Replayed] = {}
         for experiment in self._experiments:
-            wanted = validation is None or experiment.validation == validation
-            if not wanted and not carried:
-                continue
-            difference, state = self._one(model, experiment, state)
-            if wanted:
-                result[experiment.name] = difference
+            if carried or experiment.name in wanted:
+                result[experiment.name], state = self._one(model, experiment, state)
         return result
 
     def _rows(self, model: JointModel, e: Experiment, state: CarryOver | None) -> Simulated:

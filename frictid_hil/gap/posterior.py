@@ -10,6 +10,7 @@ do, and what nobody predicts widens all intervals. Coefficients are read from id
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -217,31 +218,30 @@ class Posterior:
         if terms not in self._known:
             by_setting = self._base + self._prior
             if terms:
-                by_setting = by_setting + np.array([self._gain(terms, g) for g in range(self._base.size)])
+                by_setting = by_setting + self._gains(terms)
             effects = frozenset(self.channel.candidates[t].effect for t in terms)
             self._known[terms] = Model(terms, effects, float(special.logsumexp(by_setting)), by_setting)
         return self._known[terms]
 
-    def _gain(self, terms: tuple[int, ...], g: int) -> float:
-        """What a set adds to the log chance at one point of the grid, its prior included."""
+    def _gains(self, terms: tuple[int, ...]) -> Array:
+        """What a set adds to the log chance at every point of the grid, its prior included, shape (g,)."""
         at = np.concatenate([self._local[t] for t in terms])
-        inner = self._grams[g][np.ix_(at, at)] + np.eye(at.size)
+        inner = self._grams[:, at[:, None], at] + np.eye(at.size)
         centre = self._expected(terms)
-        right = self._rights[g][at] + centre
+        right = self._rights[:, at] + centre
         covariance = np.linalg.inv(inner)
-        mean = covariance @ right
-        gain = 0.5 * float(right @ mean) - 0.5 * float(centre @ centre)
+        mean = np.einsum("gij,gj->gi", covariance, right)
         again = len(terms) - len({self.channel.candidates[t].effect for t in terms})
-        gain -= 0.5 * float(np.linalg.slogdet(inner)[1]) - float(np.sum(self._log_prior[list(terms)]))
-        gain -= again * self._log_chance
+        constant = float(np.sum(self._log_prior[list(terms)])) - again * self._log_chance - 0.5 * float(centre @ centre)
+        gains: Array = 0.5 * np.sum(right * mean, axis=1) - 0.5 * np.linalg.slogdet(inner)[1] + constant
         start = 0
         for t in terms:
             if math.isfinite(self._low[t]) or math.isfinite(self._high[t]):
-                spread = math.sqrt(covariance[start, start])
-                low, high = (self._low[t] - mean[start]) / spread, (self._high[t] - mean[start]) / spread
-                gain += float(_log_between(np.array(low), np.array(high)) - self._before[t])
+                spread = np.sqrt(covariance[:, start, start])
+                low, high = (self._low[t] - mean[:, start]) / spread, (self._high[t] - mean[:, start]) / spread
+                gains = gains + _log_between(low, high) - self._before[t]
             start += self._local[t].size
-        return gain
+        return gains
 
     def _extended(self, terms: Sequence[int], g: int) -> Array:
         """What each candidate would add to a set at one point of the grid, shape (candidates,)."""
@@ -515,8 +515,8 @@ class Draw:
 
 def by_term(terms: Sequence[Term], values: Array) -> list[tuple[Term, Array]]:
     """Terms, each with its own coefficients of a draw."""
-    ends = np.cumsum([len(term.columns) for term in terms])
-    return list(zip(terms, np.split(values, ends[:-1]), strict=True)) if terms else []
+    ends = itertools.accumulate(len(term.columns) for term in terms)
+    return [(term, values[end - len(term.columns) : end]) for term, end in zip(terms, ends, strict=True)]
 
 
 def joined(parts: Sequence[tuple[np.ndarray, Array]]) -> tuple[np.ndarray, Array]:
