@@ -63,8 +63,8 @@ LATE: tuple[tuple[ModuleType, str], ...] = (
 """What is said of a posterior."""
 SEARCHED: tuple[tuple[ModuleType, str], ...] = (
     (posterior, "EXPECTED"), (posterior, "WORTH"), (posterior, "FORM"), (posterior, "RIGID"),
-    (posterior, "MOST_DOUBT"), (posterior, "MOST"), (posterior, "TRIED"), (posterior, "POINTS"), (posterior, "STRETCHES"),
-    (plainest, "CANCELS"), (plainest, "CLEAR"),
+    (posterior, "MOST_DOUBT"), (posterior, "MOST"), (posterior, "TRIED"), (posterior, "POINTS"),
+    (posterior, "STRETCHES"), (plainest, "CANCELS"), (plainest, "CLEAR"),
 )  # fmt: skip
 """The search over models."""
 TABLES: tuple[tuple[ModuleType, str], ...] = (
