@@ -196,3 +196,12 @@ def test_calibration_is_pooled_over_checks(benchmark_named: Callable[[str], Any]
     assert [(cause.confidence, cause.there) for cause in causes] == [(0.75, True), (0.75, False)]
     told = pooled.calibration(causes)
     assert told[0].startswith("calibration error 0.250 over 2 causes") and told[1:] == ["told 0.75: there 1 of 2"]
+
+
+@pytest.mark.parametrize(("added", "just"), [({"stribeck"}, True), ({"stribeck", "backlash"}, False), (set(), False)])
+def test_true_numbers_are_asked_where_the_answer_names_just_what_is_there(
+    benchmark_named: Callable[[str], Any], added: set[str], just: bool
+) -> None:
+    sizes = {"stribeck": 3.0, "torque_bias": 0.1}
+    truth = {"contributors": [{"name": name, "size_alone": size} for name, size in sizes.items()]}
+    assert benchmark_named("gap_how_far")._just(truth, added) is just

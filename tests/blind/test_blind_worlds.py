@@ -54,6 +54,21 @@ def test_what_is_withheld_is_there_and_the_largest(drawn: tuple[Any, Any, dict[s
 
 
 @pytest.mark.slow
+def test_recorded_again_a_joint_has_other_noise_and_lacks_what_is_left_out(
+    drawn: tuple[Any, tuple[wide.Row, ...], dict[str, Any]],
+) -> None:
+    def slow_torque(rows: tuple[wide.Row, ...]) -> np.ndarray:
+        seconds, torque = (rows[-1].columns[name] for name in ("time_s", "torque_nm"))
+        even = np.arange(0.5, 10.0, 0.002)
+        return low_pass(np.interp(even, seconds, torque), 500.0)
+
+    whole, again = drawn[1], wide.recorded_again(1, 7, "single")
+    healthy = wide.recorded_again(1, 7, "single", [one["name"] for one in drawn[2]["contributors"]])
+    noise, changed = (rms(slow_torque(rows) - slow_torque(again)) for rows in (whole, healthy))
+    assert 0.0 < noise < 0.7 * changed
+
+
+@pytest.mark.slow
 def test_a_softer_presliding_shows_along_the_motion_and_hardly_in_the_loop() -> None:
     made = (wide._setting(np.random.default_rng([3, n])) for n in range(50))
     setting = next(s for s in made if s.controller == "known" and s.physics.gear_ratio > 50.0)
