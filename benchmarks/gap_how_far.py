@@ -4,10 +4,9 @@
     python benchmarks/gap_how_far.py kept [--jobs 2]
 
 Every ``explained`` answer with a figure is looked at twice. *Again*: the validation motions are recorded once more with
-other noise; what the same causes leave of them has to lie in the interval, where
-they are still the answer. *True numbers*: the joint is drawn without
-the causes that are named and recorded; its gap to the old belief has to lie in the interval, too. That is asked where
-the answer names all that shows and nothing else.
+other noise; what the same causes leave of them has to lie in the interval, where they are still the answer. *True
+numbers*: the joint is drawn without the causes that are named and recorded; its gap to the old belief has to lie in the
+interval, too. That is asked where the answer names all that shows and nothing else.
 """
 
 from __future__ import annotations
