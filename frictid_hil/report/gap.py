@@ -100,20 +100,26 @@ def _causes(causes: tuple[Cause, ...]) -> Table:
 
 
 def _how_far(found: Diagnosis) -> Table:
-    states = (found.before, found.after, found.noise_floor)
-    rows = [
-        (name, *(format_figure(getattr(state, key), unknown="cannot be formed") for state in states))
-        for name, key in (
-            ("inverse dynamics [N m]", "inverse_nm"),
-            ("torque in closed loop [N m]", "forward_torque_nm"),
-            ("position in closed loop [rad]", "forward_position_rad"),
+    rows = []
+    for name, key in (
+        ("inverse dynamics [N m]", "inverse_nm"),
+        ("torque in closed loop [N m]", "forward_torque_nm"),
+        ("position in closed loop [rad]", "forward_position_rad"),
+    ):
+        states = (found.before, found.after, found.noise_floor)
+        told = [format_figure(getattr(state, key), unknown="cannot be formed") for state in states]
+        if key in found.after_intervals:
+            low, high = found.after_intervals[key]
+            told[1] += f" ({format_figure(low)} .. {format_figure(high)})"
+        rows.append((name, *told))
+    caption = "Recordings that nothing was fitted to."
+    if (raw := found.raw) is not None:
+        caption += (
+            f" Behind a low-pass at {format_figure(raw.cutoff_hz)} Hz; before it inverse dynamics are "
+            f"{format_figure(raw.inverse_nm)}, of which noise makes {format_figure(raw.noise_floor_nm)}."
         )
-    ]
-    return Table(
-        ("RMS on validation logs", "nominal", "with the causes added", "noise floor"),
-        tuple(rows),
-        caption="Recordings that nothing was fitted to.",
-    )
+    headings = ("RMS on validation logs", "nominal", "with the causes added (95 % interval)", "noise floor")
+    return Table(headings, tuple(rows), caption=caption)
 
 
 def _per_log(per_log: Mapping[str, Mapping[str, Figures]]) -> tuple[Figure, ...]:
