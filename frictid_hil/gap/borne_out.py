@@ -53,8 +53,8 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
     values = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in said.named}
     kept, gap_nm, beside = _chosen(values, {f.effect: f.rivals for f in said.named}, loop)
     refuted = _refuted(said, values, beside, gap_nm, loop)
-    if not refuted and said.word == "unknown" and kept == [said.named[0].effect]:
-        return _rescued(said, values, loop, gap_nm)
+    if not refuted and said.word == "unknown" and any(swings(name) for name in values):
+        return _rescued(said, values, kept, loop)
     open_still = gap_nm**2 - loop.floor_nm**2 > HALF**2 * loop.visible
     read = {f.effect for f in said.named if f.where == READ_DIRECTLY or of_the_drive(f)}
     shows = gap_nm > FLOORS * loop.floor_nm and (not kept or gap_nm > loop.negligible_nm)
@@ -71,11 +71,7 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
         return replace(said, named=(*stands, *falls)), _told(kept, refuted, loop, gap_nm)
     stands.sort(key=lambda f: kept.index(f.effect) if f.effect in kept else len(kept))
     stands = [f if f.where == READ_DIRECTLY else f.at_most(DOUBTED) for f in stands]
-    helping = {name: values[name] for name in kept}
-    for k, one in enumerate(stands):
-        if one.effect in kept:
-            stands[k], gap_nm = _refined(one, helping, loop, gap_nm)
-            helping[one.effect] = {name: v.value for name, v in stands[k].parameters.items()}
+    stands, gap_nm = _refined(stands, {name: values[name] for name in kept}, loop, gap_nm)
     told = _told(kept, refuted, loop, gap_nm)
     may_stay = BOUNCED if any(swings(name) for name in kept) else REMAINS
     left = max(0.0, gap_nm**2 - loop.floor_nm**2)
@@ -98,13 +94,15 @@ def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm
     return refuted | {n for n, nm in without.items() if all_nm**2 - nm**2 > REMAINS**2 * loop.visible}
 
 
-def _rescued(said: Verdict, values: Effects, loop: Loop, gap_nm: float) -> tuple[Verdict, str | None]:
-    """A first cause that lets the link swing may close the loop, although its columns lose the link's phase."""
-    first, closer_nm = _refined(said.named[0], {said.named[0].effect: values[said.named[0].effect]}, loop, gap_nm)
-    if first is said.named[0] or closer_nm**2 - loop.floor_nm**2 > BOUNCED**2 * loop.visible:
+def _rescued(said: Verdict, values: Effects, kept: Sequence[str], loop: Loop) -> tuple[Verdict, str | None]:
+    """Causes that let the link swing may close the loop, although their columns lose the link's phase."""
+    helping = {name: values[name] for name in values if name in kept or swings(name)}
+    before = [f for f in said.named if f.effect in helping]
+    stands, closer_nm = _refined(before, helping, loop, loop.gap_nm(helping))
+    if stands == before or closer_nm**2 - loop.floor_nm**2 > BOUNCED**2 * loop.visible:
         return said, None
-    rest = [f for f in said.named if f.effect != first.effect]
-    return _doubted(Verdict("explained", (first, *rest))), _told([first.effect], set(), loop, closer_nm)
+    rest = [f for f in said.named if f.effect not in helping]
+    return _doubted(Verdict("explained", (*stands, *rest))), _told(list(helping), set(), loop, closer_nm)
 
 
 def _doubted(said: Verdict) -> Verdict:
@@ -170,22 +168,31 @@ def _taken_off(values: Effects, loop: Loop) -> tuple[list[str], float]:
     return kept, gap_nm
 
 
-def _refined(first: Finding, kept: Effects, loop: Loop, gap_nm: float) -> tuple[Finding, float]:
-    """(the first cause with the numbers that bring the simulated joint nearest, its gap), if it lets the link swing.
+def _refined(stands: Sequence[Finding], kept: Effects, loop: Loop, gap_nm: float) -> tuple[list[Finding], float]:
+    """(the causes, those that let the link swing with the numbers that bring the simulated joint nearest; its gap).
 
     Columns along the measured motion lose the phase of a link that swings, so that they tell too little of it.
     """
-    if not swings(first.effect):
-        return first, gap_nm
-    values = dict(kept[first.effect])
+    helping, result = dict(kept), []
+    for one in stands:
+        if one.effect in kept and swings(one.effect):
+            one, gap_nm = _nearest(one, helping, loop, gap_nm)
+            helping[one.effect] = {name: v.value for name, v in one.parameters.items()}
+        result.append(one)
+    return result, gap_nm
+
+
+def _nearest(cause: Finding, kept: Effects, loop: Loop, gap_nm: float) -> tuple[Finding, float]:
+    """(A cause with the numbers that bring the simulated joint nearest, the others as they are; its gap)."""
+    values = dict(kept[cause.effect])
     for name in (*values, *values):
         tried = {f * values[name]: {**values, name: f * values[name]} for f in FACTORS}
-        gaps = {value: loop.gap_nm({**kept, first.effect: numbers}) for value, numbers in tried.items()}
+        gaps = {value: loop.gap_nm({**kept, cause.effect: numbers}) for value, numbers in tried.items()}
         best = min(gaps, key=lambda value: gaps[value])
         if gaps[best] < gap_nm:
             gap_nm, values[name] = gaps[best], best
-    spread = {name: _spread(first.parameters[name], value) for name, value in values.items()}
-    return replace(first, parameters=spread), gap_nm
+    spread = {name: _spread(cause.parameters[name], value) for name, value in values.items()}
+    return replace(cause, parameters=spread), gap_nm
 
 
 def _spread(told: Value, value: float) -> Value:

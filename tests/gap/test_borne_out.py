@@ -175,6 +175,22 @@ def test_elasticity_that_the_motion_tells_badly_is_rescued_by_the_loop() -> None
     )
 
 
+def test_play_of_a_fifth_of_its_size_is_rescued_beside_a_larger_cause() -> None:
+    """Gravity took most of the gap, play as the motion tells it next to nothing, and the rest was `unknown`."""
+    play = cause("backlash", gap_rad=2e-3, contact_stiffness_nm_per_rad=2e5, contact_relaxation_s=3e-3)
+    gravity = cause("gravity_error", error_share=0.15)
+
+    def gap_nm(effects: Effects) -> float:
+        heavy = 0.0 if "gravity_error" in effects else 0.4
+        slack = 0.2 * max(0.0, 1.0 - effects.get("backlash", {}).get("gap_rad", 0.0) / 8e-3)
+        return 0.04 + heavy + slack
+
+    said, told = borne_out(Verdict("unknown", (gravity, play)), Loop(gap_nm, 0.64, 0.04))
+    assert (said.word, [f.effect for f in said.named]) == ("explained", ["gravity_error", "backlash"])
+    assert said.named[1].parameters["gap_rad"].value >= 7e-3 and said.named[0].chance == DOUBTED
+    assert told is not None and "gravity_error and backlash" in told
+
+
 def test_play_beside_another_cause_is_refined_too_and_may_leave_a_third() -> None:
     """Play whose columns told two thirds of its gap stood second, and the loop that it closes was `unknown`."""
     play = cause("backlash", gap_rad=1.5e-3, contact_stiffness_nm_per_rad=2e5, contact_relaxation_s=3e-3)
