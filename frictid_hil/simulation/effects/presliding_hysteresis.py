@@ -13,14 +13,15 @@ from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, P
 from frictid_hil.simulation.inverse import Shape, View, shared
 
 
-def level(level_nm: float, coulomb_nm: float, share: float) -> float:
-    """The stiff slip spring keeps what the soft element does not carry."""
-    return level_nm - share * coulomb_nm
+def level(level_nm: float, state: Any, at: int, share: float) -> float:
+    """The stiff slip spring keeps what the soft element does not carry, of the level as all others have made it."""
+    state[at + 1] = share * level_nm
+    return level_nm - float(state[at + 1])
 
 
-def friction(other_nm: float, coulomb_nm: float, state: Any, at: int, share: float) -> float:
+def friction(other_nm: float, state: Any, at: int) -> float:
     """The soft element's torque."""
-    return float(other_nm + share * coulomb_nm * state[at])
+    return float(other_nm + state[at + 1] * state[at])
 
 
 def remember(
@@ -70,7 +71,7 @@ EFFECT = Effect(
     name="presliding_hysteresis",
     summary="Friction builds up over a longer, rounded presliding path.",
     documentation=(
-        "A share of the Coulomb level does not follow the stiff slip spring but a soft, rounded element h: dh/dx "
+        "A share of the friction level does not follow the stiff slip spring but a soft, rounded element h: dh/dx "
         "= (1 - |h|^n (beta sgn(h dx) + 1 - beta)) / distance, with h = +-1 in full sliding. n = beta = 1 is "
         "Dahl's model, a large n an elasto-plastic spring, others a Bouc-Wen loop. Force is then lost gradually "
         "over milliradians after each reversal. It shows at reversals and in small motions, and on one sinusoid "
@@ -79,7 +80,7 @@ EFFECT = Effect(
         "J. Swevers, 'A generalized Maxwell-slip friction model', IEEE Conf. Physics and Control 2003."
     ),
     parameters=(
-        Parameter("share", 0.0, 1.0, 0.15, "part of the Coulomb level that builds up slowly", off=0.0),
+        Parameter("share", 0.0, 1.0, 0.15, "part of the friction level that builds up slowly", off=0.0),
         Parameter("distance_rad", 2e-4, 0.1, 0.01, "travel over which it builds up"),
         Parameter("loop_exponent", 0.5, 8.0, 1.0, "n: sharpness of the knee"),
         Parameter(
@@ -88,7 +89,7 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.REVERSAL, Region.STANDSTILL)),
     hooks=(
-        Hook("level", level),
+        Hook("level", level, order=95),
         Hook("friction", friction),
         Hook("remember", remember),
         Hook("settle", settle),
@@ -102,5 +103,5 @@ EFFECT = Effect(
         ),
         column,
     ),
-    state_size=1,
+    state_size=2,
 )
