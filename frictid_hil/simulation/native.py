@@ -125,7 +125,6 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
     speed = _speeds(use, falling=form == "lugre")
     odd, even = _sliding(model, speed, use)
     soft = model.effects.get("presliding_hysteresis")
-    soft_nm = soft["share"] * model.friction.coulomb_nm if soft else 0.0
     ramps: list[tuple[float, float]] = []
     dry, rise, at, poly = _with_stribeck(speed, odd, fastest) if form == "lugre" else (0.0, 0.0, 0.0, (0.0, 0.0, 0.0))
     if form == "ramps":
@@ -135,6 +134,7 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
         rise = at = 0.0
     # Friction builds up over a travel that does not depend on the level.
     stiffness = model.presliding_stiffness_nm_per_rad * dry / model.friction.coulomb_nm
+    soft_nm = soft["share"] * dry if soft else 0.0
     dry = max(1e-9, dry - soft_nm)
     inertia, step = model.inertia_kg_m2, use.timestep_s
     stiffness = min(stiffness * dry / (dry + soft_nm), _STIFFEST * inertia / step**2)

@@ -64,6 +64,16 @@ def test_errors_of_level_and_of_viscosity_add_up() -> None:
     assert steady_friction_nm(bare().with_effects(effects), speed) == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("share", [0.3, 1.0])
+@pytest.mark.parametrize("error", [-0.4, 0.5])
+def test_what_builds_up_slowly_is_a_share_of_the_level_with_its_error(share: float, error: float) -> None:
+    """A level that is lower than believed had no effect where all of it builds up slowly."""
+    soft = {"share": share, "distance_rad": 0.004, "loop_exponent": 1.0, "loop_beta": 1.0}
+    model = bare().with_effects({"presliding_hysteresis": soft, "friction_level_error": {"error_share": error}})
+    expected = (1.0 + error) * (COULOMB + VISCOUS * 0.5)
+    assert steady_friction_nm(model, np.array([0.5])) == pytest.approx(np.array([expected]))
+
+
 def test_steady_friction_of_the_plain_joint_is_its_formula() -> None:
     v = np.array([[-1.0, 0.0], [0.5, 2.0]])
     np.testing.assert_allclose(steady_friction_nm(bare(), v), COULOMB * np.sign(v) + VISCOUS * v)
