@@ -83,8 +83,8 @@ def diagnose(
     nominal = experiments.nominal
     kinematic = fit_kinematics(logs, nominal.encoder_resolution_rad, nominal.velocity_filter_s, allowed)
     simulation = _simulation(experiments, logs)
-    believed = _believed(experiments, simulation)
-    found_in = _channels(nominal, logs, allowed, reasons, kinematic, believed)
+    believed, stepped = _believed(experiments, simulation)
+    found_in = _channels(nominal, logs, allowed, reasons, kinematic, believed, stepped)
     channels = [sampled(Posterior(c, len(allowed))) for c in found_in]
     found, gaps = _read(channels, kinematic, logs, nominal)
     nothing_nm = _negligible(nominal, channels, negligible)
@@ -151,9 +151,10 @@ def _channels(
     reasons: dict[str, str],
     kinematic: Mapping[str, float],
     believed: Sequence[Recording],
+    stepped: Sequence[Recording],
 ) -> list[Channel]:
     """The channels that these recordings have."""
-    plant = plant_channel(nominal, logs, allowed, reasons, believed)
+    plant = plant_channel(nominal, logs, allowed, reasons, believed, stepped)
     if plant is None:
         reasons["inverse_nm"] = "no log has a torque"
         reasons["forward_position_rad"] = "position against the command through a fitted chain, not a replay"
@@ -174,11 +175,20 @@ def _simulation(experiments: ExperimentSet, logs: Sequence[Recording]) -> Simula
     return Simulation(replay, role, bare, _white_nm(logs), replay.steps_nm(bare, role))
 
 
-def _believed(experiments: ExperimentSet, simulation: Simulation | None) -> tuple[Recording, ...]:
-    """The believed joint recorded as the set was: what sampling and filters make of it is no gap."""
+def _believed(
+    experiments: ExperimentSet, simulation: Simulation | None
+) -> tuple[tuple[Recording, ...], tuple[Recording, ...]]:
+    """The believed joint recorded as the set was: what sampling and filters make of it is no gap.
+
+    The second is with its encoder's steps, where rows are fewer than ticks: they fold the jumps of its torque.
+    """
     if simulation is None or any(e.torque_nm is None for e in experiments.experiments):
-        return ()
-    return recordings(replace(experiments, experiments=simulation.replay.recorded()))
+        return (), ()
+    replay = simulation.replay
+    smooth = recordings(replace(experiments, experiments=replay.recorded()))
+    if not is_guessed(experiments.nominal, experiments.experiments[0]):
+        return smooth, ()
+    return smooth, recordings(replace(experiments, experiments=replay.recorded(steps=True)))
 
 
 def _hides(along: Sampled, gap: Closed, found: Sequence[Finding], simulation: Simulation) -> bool:

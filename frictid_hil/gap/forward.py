@@ -115,10 +115,11 @@ class Replay:
         self._controller = Controller(**told)
         self._held: dict[_Key, dict[str, Replayed]] = {}
 
-    def recorded(self) -> tuple[Experiment, ...]:
-        """The believed joint itself, recorded as the set was, its encoder and its drive rounding nothing."""
+    def recorded(self, *, steps: bool = False) -> tuple[Experiment, ...]:
+        """The believed joint itself, recorded as the set was, its drive rounding nothing, its encoder if it `steps`."""
         model, state = self._nominal, None
-        model = replace(model, encoder=replace(model.encoder, counts_per_revolution=0.0))
+        if not steps:
+            model = replace(model, encoder=replace(model.encoder, counts_per_revolution=0.0))
         model = replace(model, drive=replace(model.drive, torque_quantum_per_mille=0.0))
         made = []
         for e in self._experiments:

@@ -11,8 +11,10 @@ import pytest
 
 from frictid_hil.blind.generator import Assignment, draw_case, write_case
 from frictid_hil.config.nominal import Tolerance
-from frictid_hil.gap.diagnose import diagnose
+from frictid_hil.gap.diagnose import _believed, _simulation, diagnose
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
+from frictid_hil.gap.plant_channel import plant_channel
+from frictid_hil.gap.residuals import recordings, rms
 from frictid_hil.gap.tolerances import Tolerances
 from frictid_hil.gap.verdict import DOUBTED
 from frictid_hil.simulation.effects.torque_saturation import HARD, reported
@@ -132,3 +134,29 @@ def test_an_error_of_the_belief_that_makes_four_floors_in_the_loop_is_named_smal
     """It made 1.6 floors along the motion and less than 5 % of the friction, and was taken for what a belief allows."""
     found = diagnose(_drawn(("torque_constant_error",), 67, 113407, tmp_path))
     assert found.verdict == "explained" and found.causes[0].effect == "torque_constant_error"
+
+
+def _rows_kept(e: Experiment, every: int) -> Experiment:
+    assert e.velocity_rad_s is not None and e.torque_nm is not None and e.position_command_rad is not None
+    return replace(
+        e,
+        time_s=e.time_s[::every],
+        position_rad=e.position_rad[::every],
+        velocity_rad_s=e.velocity_rad_s[::every],
+        torque_nm=e.torque_nm[::every],
+        position_command_rad=e.position_command_rad[::every],
+    )
+
+
+def test_a_log_that_lacks_ticks_folds_the_jumps_of_a_coarse_encoders_torque_into_noise() -> None:
+    """Such a healthy joint had a gap of two floors along the motion, and its causes were looked for there."""
+    made = gap_sets.make(nominal=replace(gap_sets.NOMINAL, encoder_resolution_rad=5e-4))
+    thin = replace(made, experiments=tuple(_rows_kept(e, 5) for e in made.experiments))
+    logs = recordings(thin)
+    smooth, stepped = _believed(thin, _simulation(thin, logs))
+    found = [plant_channel(thin.nominal, logs, (), (), smooth, steps) for steps in ((), stepped)]
+    floors = [channel.known_floor for channel in found if channel is not None]
+    assert found[1] is not None
+    shown = rms(np.concatenate([log.y[log.told] for log in found[1].logs]))
+    assert floors[0] < 0.85 * shown and 0.9 * shown < floors[1] < 1.25 * shown
+    assert _believed(made, _simulation(made, recordings(made)))[1] == ()
