@@ -53,6 +53,10 @@ SAMPLED = {  # function: the parameters that the whole check takes; ``--long`` t
     "test_a_rigid_joint_has_no_link_in_short_programmes_or_at_250_hz": {"quick-0.004", "standard-0.001"},
     "test_six_joints_streaming_at_921600_are_within_the_bar": {"1", "5"},
     "test_a_job_whose_port_comes_back_is_fetched_to_its_end": {"0.4"},
+    "test_a_fault_in_batch_keeps_the_recording_and_resumes": {
+        *("hold@300-4-pressed hold", "unplug@1600-3-port is gone"),
+    },
+    "test_an_averaging_filter_of_150_ms_ends_in_the_gates_refusal": {"batch"},
     "test_twice_stops_quickly": {"2-15"},
     "test_an_effect_is_recorded_named_and_closed": {"torque_bias"},
 }
@@ -65,6 +69,7 @@ LONG = {  # functions that ``--long`` alone runs: what they show is shown by oth
     "test_what_was_left_out_is_told_with_its_reason",
     "test_friction_is_found_over_it",
     "test_on_the_wall_clock_it_reaches_the_same",
+    "test_recorded_again_a_joint_has_other_noise_and_lacks_what_is_left_out",
 }
 
 
