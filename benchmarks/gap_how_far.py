@@ -43,9 +43,11 @@ def main() -> None:
     seed = int(json.loads((folder / "result.json").read_text())["seed"])
     answers = [a for a in json.loads((folder / "answers.json").read_text()) if _has_interval(a)]
     with ProcessPoolExecutor(arguments.jobs) as pool:
-        rows = list(pool.map(partial(looked_at, folder, seed), answers))
-    for row in rows:
-        print(row["case"], *(f"{name} {row[name]:.4g}" for name in ("low", "after", "high", "again", "true")))
+        rows = []
+        for row in pool.map(partial(looked_at, folder, seed), answers):
+            rows.append(row)
+            figures = (f"{name} {row[name]:.4g}" for name in ("low", "after", "high", "again", "true"))
+            print(row["case"], *figures, flush=True)
     for name, what in (("again", "another recording"), ("true", "true numbers")):
         asked = [row for row in rows if row[name] == row[name]]
         held = Rate(sum(row["low"] <= row[name] <= row["high"] for row in asked), len(asked))
@@ -64,15 +66,17 @@ def looked_at(folder: Path, seed: int, answer: Plain) -> dict[str, Any]:
     truth = yaml.safe_load((folder / "truth" / f"{name}.yaml").read_text())
     causes = answer["diagnosis"]["causes"]
     added = {cause["effect"] for cause in causes if cause["confidence"] >= UNDECIDED}
-    draw = partial(recorded_again, int(name.removeprefix("case_")), seed, truth["kind"])
     told = ExperimentSet.load(folder / "cases" / name)
+    asked = [(), added] if _just(truth, added) else [()]
+    drawn = recorded_again(int(name.removeprefix("case_")), seed, truth["kind"], *asked)
+    again, *bare = [_set(folder / "cases" / name, rows) for rows in drawn]
     return {
         "case": name,
         "low": low,
         "after": gap["after"]["inverse_nm"],
         "high": high,
-        "again": _again_nm(told, _set(folder / "cases" / name, draw()), added),
-        "true": _bare_nm(_set(folder / "cases" / name, draw(added))) if _just(truth, added) else float("nan"),
+        "again": _again_nm(told, again, added),
+        "true": _bare_nm(bare[0]) if bare else float("nan"),
     }
 
 

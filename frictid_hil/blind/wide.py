@@ -143,11 +143,14 @@ def draw_wide(index: int, seed: int, kind: str) -> Drawn:
     return _nominal(name, deal.setting), logs, _truth(name, kind, deal)
 
 
-def recorded_again(index: int, seed: int, kind: str, without: Collection[str] = ()) -> tuple[Row, ...]:
-    """The motions of a case recorded once more with other noise, its joint less some contributors by name."""
+def recorded_again(index: int, seed: int, kind: str, *without: Collection[str]) -> list[tuple[Row, ...]]:
+    """The motions of a case recorded once more with other noise, once for each set of contributors its joint lacks."""
     deal = _dealt(index, seed, kind)
-    kept = [one for one in deal.reasons if one.name not in without]
-    return _recorded(np.random.default_rng([seed, 405, index]), deal.setting, *_applied(deal.setting, kept))
+    result = []
+    for left_out in without:
+        kept = [one for one in deal.reasons if one.name not in left_out]
+        result.append(_recorded(np.random.default_rng([seed, 405, index]), deal.setting, *_applied(deal.setting, kept)))
+    return result
 
 
 def _dealt(index: int, seed: int, kind: str) -> Deal:
