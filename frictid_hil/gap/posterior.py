@@ -101,7 +101,7 @@ class Posterior:
     def begin(self, library: int) -> None:
         """Nothing has been searched yet; ``library`` as above."""
         self.doubt = 1.0
-        self.chance = EXPECTED / library
+        self.chance = EXPECTED / max(library, 1)
         self._log_chance = math.log(self.chance)
         self._known: dict[tuple[int, ...], Model] = {}
         self._prepare_blocks()

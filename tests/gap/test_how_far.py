@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gap_sets
 import numpy as np
+import pytest
 
+from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.forward import Replayed, pooled
 from frictid_hil.gap.how_far import _half_width
 
@@ -35,6 +38,13 @@ def test_the_interval_holds_another_recording_and_the_true_numbers_in_nine_of_te
         true.append(low <= np.sqrt(np.mean((other - cause @ TRUE[1:]) ** 2)) <= high)
         assert high < 1.4 * low  # it says something
     assert min(np.mean(again), np.mean(true)) > 0.9
+
+
+@pytest.mark.slow
+def test_without_a_library_the_gap_is_told_all_the_same() -> None:
+    found = diagnose(gap_sets.make({"torque_bias": {"bias_nm": 0.3}}), library=())
+    assert found.before.inverse_nm == pytest.approx(0.3, rel=0.02)
+    assert "torque_bias" not in {cause.effect for cause in found.causes}
 
 
 def test_a_closed_loop_is_told_from_where_a_log_has_settled() -> None:
