@@ -77,19 +77,9 @@ TABLES: tuple[tuple[ModuleType, str], ...] = (
 )  # fmt: skip
 """The tables of the channels."""
 CHANCES = (
-    "SIDED",
-    "DOUBTED",
-    "NEEDED",
-    "CERTAIN",
-    "LEADS",
-    "EVEN",
-    "UNTOLD",
-    "REFUTED",
-    "UNDECIDED",
-    "LISTED",
-    "LIMITED",
+    "SIDED", "DOUBTED", "NEEDED", "CERTAIN", "LEADS", "EVEN", "UNTOLD", "REFUTED", "UNDECIDED", "LISTED", "LIMITED",
     "CLEARLY",
-)
+)  # fmt: skip
 
 Answer = tuple[str, str]
 """Verdict and first cause; the verdict again where none is named."""

@@ -116,7 +116,10 @@ class Replay:
         self._held: dict[_Key, dict[str, Replayed]] = {}
 
     def recorded(self, *, steps: bool = False) -> tuple[Experiment, ...]:
-        """The believed joint itself, recorded as the set was, its drive rounding nothing, its encoder if it `steps`."""
+        """The believed joint itself, recorded as the set was; its drive rounds nothing, nor does its encoder.
+
+        With ``steps`` the encoder rounds as it does.
+        """
         model, state = self._nominal, None
         if not steps:
             model = replace(model, encoder=replace(model.encoder, counts_per_revolution=0.0))

@@ -44,7 +44,7 @@ def plant_channel(
     estimated: Collection[str],
     # The believed joint recorded as the same logs, where it can be simulated: what it shows is no gap.
     believed: Sequence[Recording] = (),
-    # The same with its encoder's steps, where they make more of the rows than noise of the position does.
+    # The same with its encoder's steps: what they make of the rows is noise where it is louder than the position's own.
     stepped: Sequence[Recording] = (),
 ) -> Channel | None:
     """The channel of a set; None where no log has a torque."""
@@ -58,7 +58,8 @@ def plant_channel(
     views, noises = quiet_views(nominal, logs)
     if stepped:
         pairs = zip(stepped, believed, strict=True)
-        noises = [plant_residual(one, report) - plant_residual(other, report) for one, other in pairs]
+        folded = [plant_residual(one, report) - plant_residual(other, report) for one, other in pairs]
+        noises = [max(pair, key=rms) for pair in zip(noises, folded, strict=True)]
     measured = [r.view for r in logs if r.view is not None]
     friction_nm = rms(np.concatenate([v.coulomb_nm * v.slip + v.rate_nm for v in views]))
     scale = min(friction_nm / 3.0, _gap_nm(residuals, logs[0].step_s))

@@ -314,7 +314,7 @@ class Posterior:
         rest may lie just where a rival is better.
         """
         candidates = self.channel.candidates
-        rigid = self.model([t for t in model.terms if form_of(candidates[t].effect) == RIGID]).score
+        rigid = self.model([t for t in model.terms if form_of(candidates[t].effect) < FORM]).score
         lent = FORM**2 * (model.score - rigid) + RIGID**2 * (rigid - self.model(()).score)
         return min(MOST_DOUBT, 1.0 + max(0.0, lent))
 

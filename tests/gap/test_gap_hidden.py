@@ -160,3 +160,8 @@ def test_a_log_that_lacks_ticks_folds_the_jumps_of_a_coarse_encoders_torque_into
     shown = rms(np.concatenate([log.y[log.told] for log in found[1].logs]))
     assert floors[0] < 0.85 * shown and 0.9 * shown < floors[1] < 1.25 * shown
     assert _believed(made, _simulation(made, recordings(made)))[1] == ()
+    # An encoder that nobody states has no steps; noise of the position itself stays.
+    unstated = replace(thin, nominal=replace(thin.nominal, encoder_resolution_rad=None))
+    smooth, stepped = _believed(unstated, _simulation(unstated, logs))
+    alone, both = (plant_channel(unstated.nominal, logs, (), (), smooth, steps) for steps in ((), stepped))
+    assert alone is not None and both is not None and 0.0 < alone.known_floor == both.known_floor
