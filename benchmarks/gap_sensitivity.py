@@ -53,7 +53,7 @@ DOCS_PAGE = Path(__file__).parents[1] / "docs" / "evidence" / "gap-sensitivity.m
 BEGIN, END = "<!-- written by benchmarks/gap_sensitivity.py -->", "<!-- end of what it wrote -->"
 FACTORS = (0.5, 2.0)
 LATE: tuple[tuple[ModuleType, str], ...] = (
-    (findings, "VISIBLE"), (findings, "ABSENT"), (findings, "ALIKE"), (findings, "SIDED"), (findings, "UNTOLD"),
+    (findings, "ABSENT"), (findings, "ALIKE"), (findings, "SIDED"), (findings, "UNTOLD"),
     (verdict, "FLOORS"), (verdict, "AS_STATED"), (verdict, "MOST_EXPECTED"), (verdict, "FLOORS_AS_STATED"),
     (verdict, "STANDS_OUT"), (verdict, "REMAINS"), (verdict, "DOUBTED"), (verdict, "HALF"),
     (verdict, "LISTED"), (verdict, "NEEDED"), (verdict, "CERTAIN"), (verdict, "EVEN"), (verdict, "LEADS"),
@@ -63,7 +63,7 @@ LATE: tuple[tuple[ModuleType, str], ...] = (
 """What is said of a posterior."""
 SEARCHED: tuple[tuple[ModuleType, str], ...] = (
     (posterior, "EXPECTED"), (posterior, "WORTH"), (posterior, "FORM"), (posterior, "RIGID"),
-    (posterior, "MOST_DOUBT"), (posterior, "MOST"), (posterior, "TRIED"), (posterior, "POINTS"),
+    (posterior, "MOST_DOUBT"), (posterior, "VISIBLE"), (posterior, "MOST"), (posterior, "TRIED"), (posterior, "POINTS"),
     (posterior, "STRETCHES"), (plainest, "CANCELS"), (plainest, "CLEAR"),
 )  # fmt: skip
 """The search over models."""

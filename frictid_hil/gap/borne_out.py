@@ -7,7 +7,7 @@ joint; what brings it no nearer, alone or beside the others, is no cause of the 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Finding
@@ -34,6 +34,13 @@ class Loop:
     before_nm: float  # the same with none
     floor_nm: float  # RMS that noise alone leaves of it
     negligible_nm: float = 0.0  # gap that means nothing to the user
+    # Errors of the belief that were fitted along with the causes and are none of them.
+    tolerated: Effects = field(default_factory=dict)
+
+    def with_tolerances(self) -> Loop:
+        """The same with those errors in it."""
+        gap_nm = self.gap_nm
+        return replace(self, gap_nm=lambda effects: gap_nm({**self.tolerated, **effects}), tolerated={})
 
     @property
     def visible(self) -> float:
@@ -47,15 +54,23 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
     ``open_along``: the causes leave half of the visible gap along the measured motion.
 
     Causes are added one by one, the one that helps most first, as long as one takes ``REMAINS`` of the visible gap or
-    more; where that leaves a gap, all are added and those taken off that do harm. A cause is refuted that adds
-    ``HALF`` of the visible gap or more to what the chosen ones leave, or ``REMAINS`` if another one explains the gap.
+    more; where that leaves a gap, all are added and those taken off that do harm; and where that leaves one, too, the
+    same with the errors of the belief that were fitted along. A cause is refuted that adds ``HALF`` of the visible gap
+    or more to what the chosen ones leave, or ``REMAINS`` if another one explains the gap.
     """
     values = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in said.named}
-    kept, gap_nm, beside = _chosen(values, {f.effect: f.rivals for f in said.named}, loop)
+    rivals = {f.effect: f.rivals for f in said.named}
+    kept, gap_nm, beside = _chosen(values, rivals, loop)
+    doubtful = _open(gap_nm, loop)
+    if loop.tolerated and gap_nm**2 - loop.floor_nm**2 > REMAINS**2 * loop.visible:
+        whole = loop.with_tolerances()
+        again = _chosen(values, rivals, whole)
+        if gap_nm**2 - again[1] ** 2 > REMAINS**2 * loop.visible:
+            loop, (kept, gap_nm, beside) = whole, again
     refuted = _refuted(said, values, beside, gap_nm, loop)
     if not refuted and said.word == "unknown" and any(swings(name) for name in values):
         return _rescued(said, values, kept, loop)
-    open_still = gap_nm**2 - loop.floor_nm**2 > HALF**2 * loop.visible
+    open_still = _open(gap_nm, loop)
     read = {f.effect for f in said.named if f.where == READ_DIRECTLY or of_the_drive(f)}
     shows = gap_nm > FLOORS * loop.floor_nm and (not kept or gap_nm > loop.negligible_nm)
     leans = bool(kept and refuted)
@@ -64,7 +79,7 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
         # they describe it only with one that the loop refutes.
         return Verdict("unknown", said.named, LITTLE if kept else NO_NEARER), _told(kept, refuted, loop, gap_nm)
     if not refuted:
-        return (_doubted(said) if kept and not read and open_still else said), None
+        return (_doubted(said) if kept and not read and doubtful else said), None
     stands = [f for f in said.named if f.effect not in refuted]
     falls = [f.at_most(REFUTED) for f in said.named if f.effect in refuted]
     if said.word != "unknown" and said.named[0].effect not in refuted:
@@ -79,6 +94,11 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
         # What is read from the positions themselves is there, whatever the loop makes of the others.
         return Verdict("explained", (*stands, *falls)), told
     return Verdict("unknown", (*stands, *falls), said.place or NO_NEARER), told
+
+
+def _open(gap_nm: float, loop: Loop) -> bool:
+    """Whether half of the visible gap stays."""
+    return gap_nm**2 - loop.floor_nm**2 > HALF**2 * loop.visible
 
 
 def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm: float, loop: Loop) -> set[str]:

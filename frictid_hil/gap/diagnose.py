@@ -19,8 +19,8 @@ from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.command_timing import in_force, is_guessed
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw, Value
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
-from frictid_hil.gap.findings import Finding, Sampled, either_way, findings, sampled, whole_draws
-from frictid_hil.gap.forward import Replay, Replayed, Simulation, pooled, why_not
+from frictid_hil.gap.findings import Finding, Sampled, either_way, findings, numbers, sampled, whole_draws
+from frictid_hil.gap.forward import Effects, Replay, Replayed, Simulation, pooled, why_not
 from frictid_hil.gap.how_far import Closed, closed, held_out, simulated
 from frictid_hil.gap.kinematics import fit_kinematics
 from frictid_hil.gap.loop_channel import loop_channel
@@ -70,8 +70,28 @@ def diagnose(
     """Diagnose one joint with the effects of a library (all unless given); deterministic.
 
     ``negligible`` is the gap that the user calls none, as a share of the friction level.
+
+    A link that swings by itself may describe along the motion what is none of its doing. Where its closed loop stays
+    open, the joint is diagnosed without such causes, too, and that answer is given if it closes the loop.
     """
     allowed = tuple(n for n in all_effects() if library is None or n in library)
+    told = _diagnosed(experiments, allowed, negligible)
+    if not any(swings(cause.effect) for cause in told.causes) or not _open_loop(told):
+        return told
+    steady = _diagnosed(experiments, [n for n in allowed if not swings(n)], negligible)
+    return told if steady.verdict != "explained" or _open_loop(steady) else steady
+
+
+def _open_loop(told: Diagnosis) -> bool:
+    """Whether the causes that are told leave half of the closed loop's visible gap, or more."""
+    before, after, noise = (f.forward_torque_nm for f in (told.before, told.after, told.noise_floor))
+    if before is None or after is None or noise is None:
+        return False
+    return after**2 - noise**2 > HALF**2 * max(before**2 - noise**2, noise**2)
+
+
+def _diagnosed(experiments: ExperimentSet, allowed: Sequence[str], negligible: float) -> Diagnosis:
+    """The answer with these effects."""
     experiments, reasons = completed(in_force(as_meant(checked(experiments))))
     experiments, form = as_it_yields(experiments)
     reasons = {**reasons, **({} if form is None else {"presliding": form})}
@@ -97,13 +117,15 @@ def diagnose(
         found, gaps = _read(channels, kinematic, logs, nominal)
     if quiet and simulation is not None:
         quiet = _quiet_in_the_loop(simulation, found, channels, gaps, nothing_nm)
-    said = verdict(found, channels, gaps, nothing_nm, quiet)
+    said = verdict(found, channels, gaps, nothing_nm, quiet, simulation is not None)
     if (warning := below_first_pair(said.named, nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if simulation is not None and said.named and said.word != "none":
         said = _ranked(said, simulation, gaps, guessed=is_guessed(nominal, logs[0].experiment))
-        open_along = any(gap.channel in ("plant", "loop") and stays(gap, HALF, floors=1.0) for gap in gaps)
-        said, told = borne_out(said, _loop(simulation, gaps, nothing_nm), open_along=open_along)
+        loose = {c.name for c in found_in if c.of_the_joint or c.between_rows} | {"loop"}
+        open_along = any(gap.channel in loose and stays(gap, HALF, floors=1.0) for gap in gaps)
+        judge = _loop(simulation, gaps, nothing_nm, _tolerated(said, channels))
+        said, told = borne_out(said, judge, open_along=open_along)
         if told is not None:
             reasons["closed_loop"] = told
             gaps = _closed(channels, said.named)
@@ -322,9 +344,18 @@ def _noise_nm(simulation: Simulation, gaps: Sequence[Closed]) -> float:
     return max([simulation.noise_nm, *(gap.floor for gap in gaps if gap.channel == "actuation")])
 
 
-def _loop(simulation: Simulation, gaps: Sequence[Closed], negligible_nm: float) -> Loop:
+def _tolerated(said: Verdict, channels: Sequence[Sampled]) -> dict[str, dict[str, float]]:
+    """The errors of the belief that were fitted along with the causes and are none of them."""
+    named = {f.effect for f in said.named}
+    errors = {t.effect for c in channels for t in c.posterior.channel.nuisances if t.effect and not t.shape}
+    found = {name: numbers(name, channels) for name in sorted(errors - named)}
+    return {name: {n: v.value for n, v in values.items()} for name, values in found.items() if values}
+
+
+def _loop(simulation: Simulation, gaps: Sequence[Closed], negligible_nm: float, tolerated: Effects) -> Loop:
     """The closed loop on the logs a gap is told of, as it judges causes."""
-    return Loop(simulation.gap_nm, pooled(simulation.bare, "torque_nm"), _noise_nm(simulation, gaps), negligible_nm)
+    before_nm, noise_nm = pooled(simulation.bare, "torque_nm"), _noise_nm(simulation, gaps)
+    return Loop(simulation.gap_nm, before_nm, noise_nm, negligible_nm, tolerated)
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:

@@ -14,13 +14,11 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, STIFFNESS, Channel, Term
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.plainest import CANCELS, plainest
-from frictid_hil.gap.posterior import FORM, Draw, Posterior, by_term, form_of, joined
+from frictid_hil.gap.posterior import FORM, VISIBLE, Draw, Posterior, by_term, form_of, joined
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
 DRAWS = 400  # samples of each channel's posterior: a chance is known to 0.025
-VISIBLE = 0.5
-"""Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
 ABSENT = 0.2
 """Size, over the floor, below which a cause is absent: it adds a fiftieth. Between the two it is neither."""
 ALIKE = 0.05  # chance of another cause in the place of one from which the two are called confusable
@@ -57,6 +55,8 @@ class Sampled:
 
     posterior: Posterior  # of the channel
     draws: Sequence[Draw]  # samples
+    # Of every draw, by cause, its terms with their coefficients.
+    held: Sequence[Mapping[str, Sequence[tuple[Term, Array]]]]
     # By cause, its size over the floor in every draw less what others take back, (draws,); 0 if not in.
     sizes: Mapping[str, Array]
     # By cause, the sign of its coefficient, (draws,); 1 where it is no error of one believed number, and has no sides.
@@ -77,6 +77,7 @@ def sampled(posterior: Posterior) -> Sampled:
     x = np.concatenate([log.x[log.told] - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
     draws = [plainest(posterior, draw, gram) for draw in posterior.draws(posterior.search(), DRAWS)]
+    held = [_by_cause(posterior, draw) for draw in draws]
     made = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(5))
     sizes, signs, blurs, believed, tolerated = made
     expected = 1.0 / math.sqrt(_ways(posterior, gram))
@@ -106,7 +107,15 @@ def sampled(posterior: Posterior) -> Sampled:
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
     lent = {effect: expected * blur for effect, blur in blurs.items()}
-    return Sampled(posterior, draws, sizes, signs, blurs, lent, believed, tolerated, generic, explained, gram)
+    return Sampled(posterior, draws, held, sizes, signs, blurs, lent, believed, tolerated, generic, explained, gram)
+
+
+def _by_cause(posterior: Posterior, draw: Draw) -> dict[str, list[tuple[Term, Array]]]:
+    """The terms of one draw with their coefficients, by cause."""
+    held: dict[str, list[tuple[Term, Array]]] = {}
+    for term, values in by_term(posterior.terms(draw.model), draw.values):
+        held.setdefault(term.effect, []).append((term, values))
+    return held
 
 
 def _ways(posterior: Posterior, gram: Array) -> float:
@@ -159,7 +168,7 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
         told, other = _sides(name, channels)
         if not there.any() or told < SIDED * (told + other):
             continue
-        values = _values(name, channels)
+        values = numbers(name, channels)
         most = SURE if values else UNTOLD
         home = max(channels, key=lambda c: float(np.mean(c.sizes.get(name, np.zeros(1)) ** 2)))
         result.append(
@@ -271,7 +280,7 @@ def _rivals(row: int, names: Sequence[str], there: np.ndarray, shown: Array) -> 
     return tuple(name for _, name in sorted(found, reverse=True)[:3])
 
 
-def _values(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
+def numbers(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
     """The effect's parameters over all draws that hold it, its interval with what forms may have put on them."""
     told: dict[str, list[tuple[float, float]]] = {}
     for k, lent in enumerate(_lent(effect, channels)):
@@ -310,18 +319,17 @@ def whole_draws(effects: Sequence[str], channels: Sequence[Sampled]) -> tuple[di
 def _of_draw(effect: str, channels: Sequence[Sampled], k: int) -> dict[str, float]:
     told: dict[str, float] = {}
     for channel in channels:
-        for name, value in parameters(effect, channel, channel.draws[k]).items():
+        for name, value in parameters(effect, channel, k).items():
             told[name] = told.get(name, 0.0) + value
     return told
 
 
-def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
-    """The parameters of an effect in one draw; empty where it is not in, or only within its tolerance's shape."""
-    posterior = channel.posterior
-    terms = by_term(posterior.terms(draw.model), draw.values)
-    found = [(t, values) for t, values in terms if t.effect == effect and STIFFNESS not in t.shape]
+def parameters(effect: str, channel: Sampled, k: int) -> dict[str, float]:
+    """The parameters of an effect in draw ``k``; empty where it is not in, or only within its tolerance's shape."""
+    found = [(t, values) for t, values in channel.held[k].get(effect, ()) if STIFFNESS not in t.shape]
     if not found:
         return {}
+    posterior = channel.posterior
     if _opposed([(term, values) for term, values in found if term.shape]):
         return _read(effect, posterior.channel, *_nearest(effect, channel, found))
     told, form = _between(found), all_effects()[effect].inverse

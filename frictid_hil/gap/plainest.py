@@ -8,7 +8,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, Term
-from frictid_hil.gap.posterior import FORM, Draw, Posterior, by_term
+from frictid_hil.gap.posterior import FORM, VISIBLE, Draw, Posterior, by_term
 from frictid_hil.simulation.effects import all_effects
 
 SPEED = FAMILY + "velocity"  # functions of speed without a name
@@ -22,7 +22,8 @@ def plainest(posterior: Posterior, draw: Draw, gram: Array) -> Draw:
 
     The form of each cause is right to a tenth of it. Where several curves, or some that mostly cancel, make together
     what an error of the believed curve makes, but for such a tenth, the recordings do not tell their shapes: the error
-    is the cause, and what it leaves has no name. ``gram`` holds mean products of the channel's columns, shape (m, m).
+    is the cause, and what it leaves has no name. A tenth of large curves would show, though: no more is left than
+    stays hidden, or than has no name already. ``gram`` holds mean products of the channel's columns, shape (m, m).
     """
     terms, known = posterior.terms(draw.model), len(posterior.channel.nuisances)
     parts = [values for _, values in by_term(terms, draw.values)]
@@ -38,6 +39,7 @@ def plainest(posterior: Posterior, draw: Draw, gram: Array) -> Draw:
     if not plain or not (several or float(together @ gram @ together) < CANCELS * max(squares.values())):
         return draw
     untold = FORM**2 * sum(square for name, square in squares.items() if name != SPEED)
+    untold = min(untold, max((VISIBLE * posterior.floor) ** 2, _unnamed(terms, parts, gram)))
     for chosen in (*([k] for k in plain), plain):
         at = np.array([terms[k].columns[0] for k in chosen])
         weights = np.linalg.lstsq(gram[np.ix_(at, at)], gram[at] @ together, rcond=None)[0]
@@ -48,6 +50,15 @@ def plainest(posterior: Posterior, draw: Draw, gram: Array) -> Draw:
             values = [np.array([told.get(k, 0.0)]) if k in plain else part for k, part in enumerate(parts)]
             return _without_curves(posterior, draw, values, rest)
     return draw
+
+
+def _unnamed(terms: Sequence[Term], parts: Sequence[Array], gram: Array) -> float:
+    """Mean square of what functions without a name make together: so far is the joint off its forms, as far as seen."""
+    made = np.zeros(gram.shape[0])
+    for term, values in zip(terms, parts, strict=True):
+        if term.effect.startswith(FAMILY):
+            np.add.at(made, np.array(term.columns), values)
+    return float(made @ gram @ made)
 
 
 def _without_curves(posterior: Posterior, draw: Draw, parts: Sequence[Array], rest: Array) -> Draw:

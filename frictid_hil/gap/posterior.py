@@ -38,6 +38,8 @@ FORM = 0.1
 """One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
 RIGID = 0.02
 """The same where the mechanics of a rigid link give the form: links bend, and cables pull, by a few hundredths."""
+VISIBLE = 0.5
+"""Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
 MOST_DOUBT = 3.0
 """Variance that forms may lend to what tells causes apart, at most: more of it shows in the noise itself."""
 ROUNDING = 1e-12  # share of a matrix' largest entry that rounding may leave in the others

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from frictid_hil.gap.channel import FAMILY, Term
-from frictid_hil.gap.findings import EVEN, VISIBLE, Finding, Sampled
+from frictid_hil.gap.findings import EVEN, Finding, Sampled
 from frictid_hil.gap.how_far import Closed, coefficients
-from frictid_hil.gap.posterior import Draw
+from frictid_hil.gap.posterior import VISIBLE, Draw
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -54,23 +54,25 @@ def verdict(
     gaps: Sequence[Closed],  # of each channel
     negligible: float,  # gap that means nothing to the user, in the channels' unit
     otherwise_quiet: bool,  # the residual before any filter and the simulated closed loop show no more than noise
+    loop_judges: bool = False,  # the closed loop can be simulated
 ) -> Verdict:
     """Decide."""
-    helpless = [gap.channel for gap in gaps if gap.after > HELPS * gap.before]
-    faint = [gap.channel for c, gap in zip(channels, gaps, strict=True) if _faint(c, gap)]
     unreached = [f for f in found if needed(f, channels) and _unreached(f, channels)]
-    shown = [f for f in found if f.where not in helpless and (f.where not in faint or f.size > FLOORS)]
+    shown = _shown(found, channels, gaps, otherwise_quiet)
     named = tuple(f for f in found if f.chance >= LISTED and (f in shown or f in unreached))
     quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
     explained = _root_sum([channel.explained for channel in channels])
-    generic = _root_sum([channel.generic for channel in channels])
-    place = _place(channels)
+    # What has no name in a demand that is a guess is the guess: there the closed loop tells what stays.
+    guessed = [loop_judges and c.posterior.channel.between_rows for c in channels]
+    telling = [(c, gap) for c, gap, guess in zip(channels, gaps, guessed, strict=True) if not guess]
+    generic = _root_sum([c.generic for c, _ in telling])
+    place = _place([c for c, _ in telling])
     if any(f.where == READ_DIRECTLY for f in named):
         return Verdict("explained", named)
     sure = not _unnamed(channels) and any(_certain(f, channels, gaps) for f in named)
     nothing = not named or (float(np.median(explained)) < STANDS_OUT and not sure)
     generic_wins = float(np.mean(generic > explained)) > 0.5 and float(np.median(generic)) > STANDS_OUT
-    unnamed = _unnamed([c for c, gap in zip(channels, gaps, strict=True) if gap.before > FLOORS * gap.floor])
+    loud = [c for c, gap in zip(channels, gaps, strict=True) if gap.before > FLOORS * gap.floor]
     # A gap that is small beside the noise and small in practice is none, whatever tolerance explains it.
     floors = FLOORS_AS_STATED if as_stated(named, channels) else FLOORS
     tiny = quiet and all(gap.before <= min(floors * gap.floor, negligible) for gap in gaps)
@@ -84,13 +86,13 @@ def verdict(
     new = any(gap.appeared is not None and stays(gap, REMAINS) for gap in gaps)
     # Where functions without a name describe it as well, the names tell the gap only if they close it, and not at all
     # where those functions make more of it.
-    untold = unnamed and any(stays(gap, REMAINS) for gap in gaps)
-    if nothing or generic_wins or untold or new or any(_open(gap, negligible) for gap in gaps):
+    untold = _unnamed([c for c, _ in telling if c in loud]) and any(stays(gap, REMAINS) for _, gap in telling)
+    if nothing or generic_wins or untold or new or any(_open(gap, negligible) for _, gap in telling):
         # A link that swings may be no help along the motion, and close the loop all the same.
         return Verdict("unknown", named or tuple(f for f in found if f.chance >= LISTED and swings(f.effect)), place)
     if (varies := next((f for f in named if f.chance >= EVEN and _varies(f, channels)), None)) is not None:
         return Verdict("unknown", named, f"{varies.where}: {varies.effect} that comes and goes")
-    if unnamed or any(stays(gap, REMAINS) for gap in gaps):
+    if _unnamed(loud) or any(stays(gap, REMAINS) for gap in gaps):
         # What stays may be of another cause. An error within its tolerance is to be expected, whatever else is there.
         named = tuple(f if expected(f, channels) else f.at_most(DOUBTED) for f in named)
     first = named[0]
@@ -98,6 +100,21 @@ def verdict(
     if first.leads < LEADS and rivals:
         return Verdict("ambiguous", named)
     return Verdict("explained", named)
+
+
+def _shown(
+    found: Sequence[Finding], channels: Sequence[Sampled], gaps: Sequence[Closed], otherwise_quiet: bool
+) -> list[Finding]:
+    """Causes that help on the validation logs, and are no more than what a replay between rows may leave by itself.
+
+    Where the closed loop shows a gap that no other cause is likely to make, it is no such leaving.
+    """
+    helpless = [gap.channel for gap in gaps if gap.after > HELPS * gap.before]
+    faint = [gap.channel for c, gap in zip(channels, gaps, strict=True) if _faint(c, gap)]
+    plain = [f for f in found if f.where not in helpless and (f.where not in faint or f.size > FLOORS)]
+    if otherwise_quiet or any(f.chance >= EVEN for f in plain):
+        return plain
+    return [f for f in found if f.where not in helpless]
 
 
 def needed(cause: Finding, channels: Sequence[Sampled]) -> bool:

@@ -51,6 +51,20 @@ def test_two_causes_that_help_only_together_stand() -> None:
     assert told is not None and "0.1 with controller_gain_error and inertia_error" in told
 
 
+@pytest.mark.parametrize(("bent_nm", "refuted"), [(0.1, False), (0.9, True)])
+def test_a_cause_is_tried_with_the_errors_that_were_fitted_along(bent_nm: float, refuted: bool) -> None:
+    """A bent curve and an error of the viscosity within its tolerance take a part of one another back."""
+    gaps = {"electrical_lag": 0.9, "viscous_nonlinearity": 1.6, "electrical_lag+viscous_nonlinearity": 1.5}
+    gaps |= {"viscous_error": 2.0, "electrical_lag+viscous_error": 1.9, "viscous_error+viscous_nonlinearity": 1.8}
+    judge = loop({**gaps, "electrical_lag+viscous_error+viscous_nonlinearity": bent_nm})
+    judge = replace(judge, tolerated={"viscous_error": {"error_share": -0.1}})
+    named = (cause("viscous_nonlinearity"), cause("electrical_lag", "actuation"))
+    said, _ = borne_out(Verdict("explained", named), judge)
+    assert ("viscous_nonlinearity" in {f.effect for f in said.named if f.chance == REFUTED}) is refuted
+    alone, _ = borne_out(Verdict("explained", named), replace(judge, tolerated={}))
+    assert "viscous_nonlinearity" in {f.effect for f in alone.named if f.chance == REFUTED}
+
+
 def test_a_rival_stands_in_the_place_of_a_cause_and_not_beside_it() -> None:
     first = replace(cause("load_dependent_friction", chance=0.75), rivals=("directional_efficiency",))
     named = (first, cause("directional_efficiency", chance=0.25))

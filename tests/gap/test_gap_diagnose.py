@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import gap_sets
 import numpy as np
 import pytest
 
+from frictid_hil.gap import diagnose as diagnosis
 from frictid_hil.gap.diagnose import diagnose
+from frictid_hil.gap.diagnosis import Figures
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, pooled
 from frictid_hil.gap.residuals import LowPass, recordings, rms
@@ -253,3 +258,24 @@ def test_concave_curve_below_its_first_pair_is_not_called_stribeck() -> None:
     made = gap_sets.make(nominal=true)
     d = diagnose(replace(made, nominal=gap_sets.NOMINAL))
     assert not any(c.effect == "stribeck" and c.confidence >= 0.6 for c in d.causes)
+
+
+@pytest.mark.parametrize(
+    ("elastic_nm", "steady_nm", "first"),
+    [(0.7, 0.1, "inertia_error"), (0.7, 0.7, "joint_elasticity"), (0.1, 0.1, "joint_elasticity")],
+)
+def test_a_link_that_swings_gives_way_to_what_closes_the_loop(
+    monkeypatch: pytest.MonkeyPatch, elastic_nm: float, steady_nm: float, first: str
+) -> None:
+    """Along a motion an elastic joint passes for a wrong inertia; in closed loop it swings."""
+    told = {"joint_elasticity": elastic_nm, "inertia_error": steady_nm}
+
+    def diagnosed(_: object, allowed: Sequence[str], __: float) -> SimpleNamespace:
+        name = next(n for n in told if n in allowed)
+        before, after, noise = (Figures(forward_torque_nm=nm) for nm in (1.0, told[name], 0.05))
+        causes = (SimpleNamespace(effect=name),)
+        return SimpleNamespace(verdict="explained", causes=causes, before=before, after=after, noise_floor=noise)
+
+    monkeypatch.setattr(diagnosis, "_diagnosed", diagnosed)
+    answer = diagnose(cast(ExperimentSet, None))
+    assert answer.causes[0].effect == first

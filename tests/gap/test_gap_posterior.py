@@ -16,7 +16,6 @@ from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.findings import (
     ABSENT,
     DRAWS,
-    VISIBLE,
     Finding,
     _beyond,
     _chances,
@@ -30,7 +29,7 @@ from frictid_hil.gap.findings import (
 )
 from frictid_hil.gap.plainest import plainest
 from frictid_hil.gap.plant_channel import plant_channel
-from frictid_hil.gap.posterior import Draw, Posterior, _integrated, _put_inside
+from frictid_hil.gap.posterior import VISIBLE, Draw, Posterior, _integrated, _put_inside, by_term
 from frictid_hil.gap.residuals import recordings
 from frictid_hil.gap.tolerances import Sigma
 from frictid_hil.simulation.effects import all_effects
@@ -92,16 +91,18 @@ def test_two_shapes_of_a_whole_cause_are_that_cause_once(strength: float) -> Non
 
 
 def _curves() -> tuple[Posterior, np.ndarray]:
-    """A channel with the level of friction as a belief, and a Stribeck and a bent curve as causes."""
+    """A channel with the level of friction as a belief, a Stribeck and a bent curve as causes, a function of time."""
     random = np.random.default_rng(5)
     speed = np.abs(np.sin(np.linspace(0.0, 40.0, 1600)))
-    columns = np.stack([1.0 + 0.2 * speed, np.exp(-speed / 0.2), np.log1p(speed / 0.06)], axis=1)
+    of_time = np.sin(np.linspace(0.0, 3.0, 1600))
+    columns = np.stack([1.0 + 0.2 * speed, np.exp(-speed / 0.2), np.log1p(speed / 0.06), of_time], axis=1)
     log = Rows("log", False, 0.0, random.standard_normal(1600), columns, np.zeros(1600), np.ones(1600, dtype=bool))
     stated = Term("friction_level_error", {}, (0,), np.zeros(1), np.full(1, 0.05))
     candidates = [
         replace(stated, deviation=np.full(1, 0.3)),
         Term("stribeck", {"stribeck_velocity_rad_s": 0.2, "exponent": 1.0}, (1,), np.zeros(1), np.ones(1)),
         Term("viscous_nonlinearity", {"knee_rad_s": 0.06, "bend": 0.0}, (2,), np.zeros(1), np.ones(1)),
+        Term(FAMILY + "time", {"size": 1.0}, (3,), np.zeros(1), np.ones(1)),
     ]
     channel = Channel("plant", 0.01, (log,), (stated,), tuple(candidates), 1.0, 20.0)
     return Posterior(channel, 20), columns
@@ -110,17 +111,29 @@ def _curves() -> tuple[Posterior, np.ndarray]:
 def test_curves_that_cancel_into_an_error_of_the_believed_curve_are_that_error() -> None:
     posterior, columns = _curves()
     gram = columns.T @ columns / columns.shape[0]
-    curves = np.linalg.lstsq(columns[:, 1:], columns[:, 0], rcond=None)[0]
+    curves = np.linalg.lstsq(columns[:, 1:3], columns[:, 0], rcond=None)[0]
     draw = Draw(posterior.model((1, 2)), 0, np.array([-0.85, *curves]))
     told = plainest(posterior, draw, gram)
     assert told.model.effects == {"friction_level_error"}
     assert told.values == pytest.approx([0.15, 0.0], abs=0.02)
     # Nothing is lost: what the error leaves is there, without a name.
-    made = [np.zeros(3), np.zeros(3)]
+    made = [np.zeros(4), np.zeros(4)]
     for one, sums in zip((draw, told), made, strict=True):
         for numbers, values in posterior.contributions(one).values():
             np.add.at(sums, numbers, values)
     np.testing.assert_allclose(made[0], made[1])
+
+
+@pytest.mark.parametrize(("times", "unnamed", "told"), [(1.0, 0.0, True), (40.0, 0.0, False), (40.0, 9.0, True)])
+def test_what_curves_leave_of_an_error_is_no_more_than_is_hidden_or_has_no_name(
+    times: float, unnamed: float, told: bool
+) -> None:
+    """A tenth of a large curve would show, unless the joint is as far off its forms elsewhere."""
+    posterior, columns = _curves()
+    gram = columns.T @ columns / columns.shape[0]
+    curves = np.linalg.lstsq(columns[:, 1:3], columns[:, 0], rcond=None)[0] * times
+    draw = Draw(posterior.model((1, 2, 3)), 0, np.array([-0.85 * times, *curves, unnamed]))
+    assert ("stribeck" not in plainest(posterior, draw, gram).model.effects) is told
 
 
 def test_a_curve_that_nothing_cancels_keeps_its_name() -> None:
@@ -188,23 +201,23 @@ def test_lines_over_position_are_read_each_by_its_own_coefficients() -> None:
     terms = [
         Term("torque_ripple", s, c, np.zeros(len(c)), np.ones(len(c))) for s, c in zip(lines, columns, strict=True)
     ]
-    posterior = SimpleNamespace(channel=SimpleNamespace(name="plant", of_the_joint=True), terms=lambda _: terms)
-    values = np.array([0.1, 0.0, 2.0, 0.0, 0.0, 1.0, 0.2, 0.0])
-    draw: Any = SimpleNamespace(model=None, values=values)
-    channel: Any = SimpleNamespace(posterior=posterior)
-    told = parameters("torque_ripple", channel, draw)
+    posterior = SimpleNamespace(channel=SimpleNamespace(name="plant", of_the_joint=True))
+    two = np.array([0.1, 0.0, 2.0, 0.0, 0.0, 1.0, 0.2, 0.0])
+    one = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0])
+    held = [{"torque_ripple": by_term(terms, values)} for values in (two, one)]
+    channel: Any = SimpleNamespace(posterior=posterior, held=held)
+    told = parameters("torque_ripple", channel, 0)
     assert sorted(v for name, v in told.items() if name.endswith("amplitude_nm")) == [1.0, 2.0]
-    draw.values = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0])
-    told = parameters("torque_ripple", channel, draw)
+    told = parameters("torque_ripple", channel, 1)
     assert next(v for name, v in told.items() if name.endswith("amplitude_nm")) == 0.2
 
 
 def test_two_delays_that_pull_the_same_way_are_one_between_them() -> None:
     terms = [Term("torque_delay", {"delay_s": s}, (k,), np.ones(1), np.ones(1)) for k, s in enumerate((0.02, 0.04))]
-    posterior = SimpleNamespace(channel=SimpleNamespace(name="tracking", of_the_joint=False), terms=lambda _: terms)
-    draw: Any = SimpleNamespace(model=None, values=np.array([0.5, 0.5]))
-    channel: Any = SimpleNamespace(posterior=posterior)
-    assert parameters("torque_delay", channel, draw) == pytest.approx({"delay_s": 0.03})
+    posterior = SimpleNamespace(channel=SimpleNamespace(name="tracking", of_the_joint=False))
+    held = [{"torque_delay": by_term(terms, np.array([0.5, 0.5]))}]
+    channel: Any = SimpleNamespace(posterior=posterior, held=held)
+    assert parameters("torque_delay", channel, 0) == pytest.approx({"delay_s": 0.03})
 
 
 @pytest.mark.parametrize(("believed", "blur"), [(0.2, 1.0), (1.0, 1.0), (4.0, 1.0), (1.0, 0.3)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 from frictid_hil.gap.channel import Term
 from frictid_hil.gap.findings import DRAWS, SIDED, Finding, Sampled, findings
 from frictid_hil.gap.how_far import Closed
-from frictid_hil.gap.verdict import verdict
+from frictid_hil.gap.verdict import _shown, verdict
 
 CAUSE = "torque_saturation"
 ERROR = "gravity_error"
@@ -27,6 +28,7 @@ def channel(name: str, cause: str, size: float, signs: np.ndarray, *, between_ro
         nuisances=nuisances,
         between_rows=between_rows,
         logs=(),
+        judged=(),
         level_free=False,
         of_the_joint=name in ("plant", "loop"),
     )
@@ -44,9 +46,9 @@ def channel(name: str, cause: str, size: float, signs: np.ndarray, *, between_ro
     def each(value: float) -> dict[str, np.ndarray]:
         return {cause: np.full(DRAWS, value)}
 
-    sizes = each(size)
+    sizes, terms = each(size), [{cause: [(term, draw.values)]} for draw in draws]
     return Sampled(
-        posterior, draws, sizes, {cause: signs}, each(0.1), each(0.1), each(10.0), each(10.0),
+        posterior, draws, terms, sizes, {cause: signs}, each(0.1), each(0.1), each(10.0), each(10.0),
         np.zeros(DRAWS), sizes[cause], np.ones((1, 1)),
     )  # fmt: skip
 
@@ -62,6 +64,31 @@ def test_a_cause_that_identification_logs_hold_outweighs_a_channel_that_is_faint
     drawn = channel("plant", CAUSE, size, np.ones(DRAWS), between_rows=True)
     gap = Closed("plant", 1.9, 1.0, 0.99, 1.01, floor=1.0)
     assert verdict([sure(size)], [drawn], [gap], NEGLIGIBLE, otherwise_quiet=True).word == word
+
+
+@pytest.mark.parametrize(("judged", "word"), [(True, "explained"), (False, "unknown")])
+def test_what_stays_of_a_guessed_demand_is_left_to_the_closed_loop(judged: bool, word: str) -> None:
+    drawn = channel("plant", CAUSE, 8.8, np.ones(DRAWS))
+    guess = replace(
+        channel("actuation", "torque_delay", 0.0, np.ones(DRAWS), between_rows=True), generic=np.full(DRAWS, 9.0)
+    )
+    gaps = [Closed("plant", 8.9, 1.1, 1.0, 1.2, floor=1.0), Closed("actuation", 9.0, 9.0, 8.9, 9.1, floor=1.0)]
+    said = verdict([sure(8.8)], [drawn, guess], gaps, NEGLIGIBLE, otherwise_quiet=False, loop_judges=judged)
+    assert said.word == word
+
+
+@pytest.mark.parametrize(("quiet", "likely", "named"), [(False, 0.3, True), (True, 0.3, False), (False, 0.9, False)])
+def test_a_faint_replay_between_rows_names_what_nobody_else_makes_of_the_closed_loop(
+    quiet: bool, likely: float, named: bool
+) -> None:
+    drawn = [
+        channel("plant", CAUSE, 1.0, np.ones(DRAWS)),
+        channel("actuation", "torque_delay", 1.3, np.ones(DRAWS), between_rows=True),
+    ]
+    late = Finding("torque_delay", 0.99, 0.99, 1.3, 0.5, {}, (), "actuation")
+    other = Finding(CAUSE, likely, likely, 1.0, 0.5, {}, (), "plant")
+    gaps = [Closed("plant", 1.5, 1.0, 0.8, 1.0, floor=1.0), Closed("actuation", 1.7, 0.9, 0.8, 1.0, floor=1.0)]
+    assert (late in _shown([late, other], drawn, gaps, quiet)) is named
 
 
 @pytest.mark.parametrize(("after", "word"), [(1.1, "explained"), (1.75, "none")])
