@@ -11,7 +11,7 @@ import numpy as np
 from frictid_hil.config.nominal import ReportFilter
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Builder, Channel, Term, of_each_log, rows_of
-from frictid_hil.gap.command_timing import FASTEST, between_rows
+from frictid_hil.gap.command_timing import FASTEST, PLAUSIBLE, ROUNDS, between_rows
 from frictid_hil.gap.experiment_set import GAINS, Controller, Nominal, with_gains
 from frictid_hil.gap.plant_channel import BEYOND, families_of, white_nm, without_nuisances
 from frictid_hil.gap.residuals import (
@@ -34,8 +34,6 @@ SLOWEST = 10
 WITHIN_ROWS = 0.3
 """One-sigma of when a command took effect and a velocity was taken, in rows of a log slower than its controller."""
 LIMITED = 0.99  # share of the torque limit from which a demand is limited
-ROUNDS = 3  # times that errors of gains are fitted where the demand is not linear in them
-PLAUSIBLE = (-0.9, 4.0)  # errors of a gain that are sought
 NEAREST = (1.0 / math.sqrt(2.0), math.sqrt(2.0))
 """Coefficients of a time: values to try at most double, so that the nearest one is no further from the true one."""
 

@@ -6,15 +6,19 @@ the next one, or sent a little later. With a stiff loop a millisecond of that is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal
+from frictid_hil.gap.experiment_set import GAINS, Controller, Experiment, ExperimentSet, Nominal, with_gains
 from frictid_hil.gap.forward import Replay, why_not
-from frictid_hil.gap.residuals import LowPass, demand_of, held, uniform
+from frictid_hil.gap.presliding import CLEARLY
+from frictid_hil.gap.residuals import LowPass, demand_of, demand_parts, held, uniform
 
+ROUNDS = 3  # times that errors of the gains are fitted: a limited demand, or that of a cascade, is not linear in them
+PLAUSIBLE = (-0.9, 4.0)  # errors of a gain that are sought
 FASTEST = 1.05  # rows of the log to a control tick, above which it holds what the controller never saw
 
 
@@ -29,17 +33,16 @@ def in_force(experiments: ExperimentSet) -> ExperimentSet:
     What the believed joint itself shows on a log so slow is no lateness, where it can be simulated.
     """
     nominal = experiments.nominal
-    tables = []
-    if any(is_guessed(nominal, e) for e in experiments.experiments):
-        known = why_not(experiments) is None
-        exact = Replay(experiments).recorded() if known else (None,) * len(experiments.experiments)
-        pairs = list(zip(experiments.experiments, exact, strict=True))
-        fitted = [(e, own) for e, own in pairs if not e.validation] or pairs
-        tables = [_table(nominal.controller, e, own) for e, own in fitted if is_guessed(nominal, e)]
-    if not tables:
+    if not any(is_guessed(nominal, e) for e in experiments.experiments):
         return experiments
-    table = np.concatenate(tables)
-    late = float(np.clip(np.linalg.lstsq(table[:, :-1], table[:, -1], rcond=None)[0][0], 0.0, 1.0))
+    known = why_not(experiments) is None
+    exact = Replay(experiments).recorded() if known else (None,) * len(experiments.experiments)
+    pairs = list(zip(experiments.experiments, exact, strict=True))
+    fitted = [(e, own) for e, own in pairs if not e.validation] or pairs
+    logs = [(e, own) for e, own in fitted if is_guessed(nominal, e)]
+    if not logs or nominal.controller is None:
+        return experiments
+    late = _lateness(nominal.controller, logs)
     shifted = [_shifted(e, late) for e in experiments.experiments]
     return replace(experiments, experiments=tuple(shifted))
 
@@ -55,16 +58,46 @@ def _shifted(e: Experiment, late: float) -> Experiment:
     return e if command is None else replace(e, position_command_rad=(1.0 - late) * command + late * held(command))
 
 
-def _table(controller: Controller | None, raw: Experiment, exact: Experiment | None) -> Array:
-    """What a command one row later and a constant would change, and the torque that is left, (rows, 3)."""
+def _lateness(controller: Controller, logs: Sequence[tuple[Experiment, Experiment | None]]) -> float:
+    """Rows by which commands came into force later than they were sent, as the torques fit best; from 0 to 1.
+
+    Wrong gains would pass for lateness: they are fitted along where that clearly leaves less.
+    """
+    as_stated, stated = _fitted(_tables(controller, controller, logs)[:, len(GAINS) :])
+    shares: Array = np.zeros(len(GAINS))
+    late, left = as_stated[0], stated
+    for _ in range(ROUNDS):
+        numbers, left = _fitted(_tables(with_gains(controller, shares.tolist()), controller, logs))
+        gains, late = numbers[: len(GAINS)], numbers[len(GAINS)]
+        shares = np.clip((1.0 + shares) * (1.0 + gains) - 1.0, *PLAUSIBLE)
+    late = late if left < CLEARLY * stated else as_stated[0]
+    return float(np.clip(late, 0.0, 1.0))
+
+
+def _fitted(table: Array) -> tuple[Array, float]:
+    """(Coefficients of all columns that explain the last one best, the sum of squares that stays)."""
+    numbers = np.linalg.lstsq(table[:, :-1], table[:, -1], rcond=None)[0]
+    return numbers, float(np.sum((table[:, -1] - table[:, :-1] @ numbers) ** 2))
+
+
+def _tables(there: Controller, stated: Controller, logs: Sequence[tuple[Experiment, Experiment | None]]) -> Array:
+    return np.concatenate([_table(there, stated, e, exact) for e, exact in logs])
+
+
+def _table(there: Controller, stated: Controller, raw: Experiment, exact: Experiment | None) -> Array:
+    """What other gains, a command one row later and a constant would change, and the torque that is left, (rows, 6).
+
+    ``there`` has the gains about which others are tried, ``exact`` is the believed joint under the ``stated`` ones.
+    """
     e, step_s, _ = uniform(raw)
-    assert controller is not None and e.torque_nm is not None
-    demand = demand_of(controller, e, step_s)
-    late = demand_of(controller, _shifted(e, 1.0), step_s) - demand
+    assert e.torque_nm is not None
+    demand = demand_of(there, e, step_s)
+    late = demand_of(there, _shifted(e, 1.0), step_s) - demand
     left = e.torque_nm - held(demand)
     if exact is not None and exact.torque_nm is not None:
-        left -= exact.torque_nm - held(demand_of(controller, exact, step_s))
-    columns = np.column_stack([held(np.column_stack([late, np.ones_like(demand)])), left])
+        left -= exact.torque_nm - held(demand_of(stated, exact, step_s))
+    gains = demand_parts(there, e, step_s, [0.0] * len(GAINS))
+    columns = np.column_stack([held(np.column_stack([gains, late, np.ones_like(demand)])), left])
     low_pass = LowPass.at(1.0 / step_s)
     rows: Array = low_pass(columns)[5 : -5 : low_pass.stride]
     return rows
