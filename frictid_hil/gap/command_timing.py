@@ -14,11 +14,12 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import GAINS, Controller, Experiment, ExperimentSet, Nominal, with_gains
 from frictid_hil.gap.forward import Replay, why_not
-from frictid_hil.gap.presliding import CLEARLY
 from frictid_hil.gap.residuals import LowPass, demand_of, demand_parts, held, uniform
 
 ROUNDS = 3  # times that errors of the gains are fitted: a limited demand, or that of a cascade, is not linear in them
 PLAUSIBLE = (-0.9, 4.0)  # errors of a gain that are sought
+WRONG = 0.1  # error of a gain, over it, from which on it is plainly wrong
+HALVED = 0.5  # torque that other gains leave over what the stated ones do, above which they are none
 FASTEST = 1.05  # rows of the log to a control tick, above which it holds what the controller never saw
 
 
@@ -61,7 +62,8 @@ def _shifted(e: Experiment, late: float) -> Experiment:
 def _lateness(controller: Controller, logs: Sequence[tuple[Experiment, Experiment | None]]) -> float:
     """Rows by which commands came into force later than they were sent, as the torques fit best; from 0 to 1.
 
-    Wrong gains would pass for lateness: they are fitted along where that clearly leaves less.
+    Plainly wrong gains would pass for lateness. Small errors of the gains do so little, and on a joint that trails its
+    command the two are alike.
     """
     as_stated, stated = _fitted(_tables(controller, controller, logs)[:, len(GAINS) :])
     shares: Array = np.zeros(len(GAINS))
@@ -70,8 +72,8 @@ def _lateness(controller: Controller, logs: Sequence[tuple[Experiment, Experimen
         numbers, left = _fitted(_tables(with_gains(controller, shares.tolist()), controller, logs))
         gains, late = numbers[: len(GAINS)], numbers[len(GAINS)]
         shares = np.clip((1.0 + shares) * (1.0 + gains) - 1.0, *PLAUSIBLE)
-    late = late if left < CLEARLY * stated else as_stated[0]
-    return float(np.clip(late, 0.0, 1.0))
+    plainly = left < HALVED**2 * stated and float(np.max(np.abs(shares))) > WRONG
+    return float(np.clip(late if plainly else as_stated[0], 0.0, 1.0))
 
 
 def _fitted(table: Array) -> tuple[Array, float]:

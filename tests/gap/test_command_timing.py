@@ -15,13 +15,17 @@ STEP_S = 0.002
 LOOP = Controller(1000.0, 9000.0, 0.0, 420.0, command_rate_weight=0.0)
 
 
-def recorded(late_rows: float, rate_hz: float = 1000.0) -> ExperimentSet:
-    """A joint that trails its command by 40 ms under a stiff loop; its torque is the mean over the row before."""
+def recorded(late_rows: float, rate_hz: float = 1000.0, shaken_rad: float = 0.0) -> ExperimentSet:
+    """A joint that trails its command by 40 ms under a stiff loop; its torque is the mean over the row before.
+
+    What shakes it tells gains from lateness: of a joint that does nothing but trail, they make the same.
+    """
     time = STEP_S * np.arange(3000)
     command = 0.5 * np.sin(3.0 * time) + 0.1 * np.sin(11.0 * time)
 
     def follows(at: np.ndarray) -> np.ndarray:
-        return 0.5 * np.sin(3.0 * (at - 0.04)) + 0.1 * np.sin(11.0 * (at - 0.04))
+        shakes = shaken_rad * (np.sin(23.0 * at) + np.cos(37.0 * at))
+        return 0.5 * np.sin(3.0 * (at - 0.04)) + 0.1 * np.sin(11.0 * (at - 0.04)) + shakes
 
     position, between = follows(time), follows(time - 0.5 * STEP_S)
     speed = np.gradient(between, STEP_S)
@@ -40,6 +44,19 @@ def test_a_command_comes_when_it_did(late: float) -> None:
     moved = (1.0 - late) * raw.position_command_rad + late * held(raw.position_command_rad)
     # A tick's velocity is a quarter of a row old, which looks like a trace of lateness.
     assert np.max(np.abs(found.position_command_rad - moved)) < 0.1 * np.max(np.abs(np.diff(moved)))
+
+
+@pytest.mark.parametrize("gain", ["kp_nm_per_rad", "kd_nm_s_per_rad"])
+@pytest.mark.parametrize("late", [0.1, 0.5])
+def test_a_gain_that_is_plainly_wrong_is_no_lateness(late: float, gain: str) -> None:
+    made = recorded(late, shaken_rad=0.02)
+    stated = replace(LOOP, rate_hz=1000.0, **{gain: 1.4 * getattr(LOOP, gain)})
+    raw = made.experiments[0].position_command_rad
+    found = in_force(replace(made, nominal=replace(made.nominal, controller=stated))).experiments[0]
+    assert raw is not None and found.position_command_rad is not None
+    moved = (1.0 - late) * raw + late * held(raw)
+    # Wrong gains alone would make it a whole row.
+    assert np.max(np.abs(found.position_command_rad - moved)) < 0.3 * np.max(np.abs(np.diff(moved)))
 
 
 def test_a_log_that_holds_every_tick_stays_as_it_is() -> None:
