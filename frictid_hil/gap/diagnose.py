@@ -40,6 +40,7 @@ from frictid_hil.gap.verdict import (
     FLOORS_AS_STATED,
     HALF,
     READ_DIRECTLY,
+    REMAINS,
     STANDS_OUT,
     TIED,
     Verdict,
@@ -71,27 +72,50 @@ def diagnose(
 
     ``negligible`` is the gap that the user calls none, as a share of the friction level.
 
-    A link that swings by itself may describe along the motion what is none of its doing. Where its closed loop stays
-    open, the joint is diagnosed without such causes, too, and that answer is given if it closes the loop.
+    The closed loop judges how the recordings were read. Where the causes leave a gap there, the joint is diagnosed once
+    more without links that swing, as their columns lose the phase along a motion, and by what the loop's torque says,
+    as a coarse encoder hides much of it along the motion. The answer that brings the simulated joint nearer is given.
     """
     allowed = tuple(n for n in all_effects() if library is None or n in library)
     told = _diagnosed(experiments, allowed, negligible)
-    if not any(swings(cause.effect) for cause in told.causes) or not _open_loop(told):
+    if told.verdict == "none" or not _leaves(told, REMAINS):
         return told
-    steady = _diagnosed(experiments, [n for n in allowed if not swings(n)], negligible)
-    return told if steady.verdict != "explained" or _open_loop(steady) else steady
+    others = []
+    if any(swings(cause.effect) for cause in told.causes):
+        others.append(_diagnosed(experiments, [n for n in allowed if not swings(n)], negligible))
+    along_nm, loop_nm = told.noise_floor.inverse_nm, told.noise_floor.forward_torque_nm
+    if along_nm is not None and loop_nm is not None and loop_nm < COARSE * along_nm and "encoder" not in told.reasons:
+        others.append(_diagnosed(experiments, allowed, negligible, in_loop=True))
+    for other in others:
+        if other.verdict == "explained" and not _leaves(other, HALF) and _nearer(other, told):
+            told = other
+    return told
 
 
-def _open_loop(told: Diagnosis) -> bool:
-    """Whether the causes that are told leave half of the closed loop's visible gap, or more."""
+def _leaves(told: Diagnosis, part: float) -> bool:
+    """Whether the causes that are told leave more than a part of the closed loop's visible gap."""
+    left, visible = _squares(told)
+    return left > part**2 * visible
+
+
+def _nearer(one: Diagnosis, other: Diagnosis) -> bool:
+    """Whether one answer takes a fair part more of the closed loop's visible gap than another."""
+    left, visible = _squares(other)
+    return left - _squares(one)[0] > REMAINS**2 * visible
+
+
+def _squares(told: Diagnosis) -> tuple[float, float]:
+    """(What the causes leave of the closed loop's gap, that gap), beyond noise, N^2 m^2; 0 where none is simulated."""
     before, after, noise = (f.forward_torque_nm for f in (told.before, told.after, told.noise_floor))
     if before is None or after is None or noise is None:
-        return False
-    return after**2 - noise**2 > HALF**2 * max(before**2 - noise**2, noise**2)
+        return 0.0, 0.0
+    return after**2 - noise**2, max(before**2 - noise**2, noise**2)
 
 
-def _diagnosed(experiments: ExperimentSet, allowed: Sequence[str], negligible: float) -> Diagnosis:
-    """The answer with these effects."""
+def _diagnosed(
+    experiments: ExperimentSet, allowed: Sequence[str], negligible: float, *, in_loop: bool = False
+) -> Diagnosis:
+    """The answer with these effects; what makes the torque is read ``in_loop``, or there where the motion hides it."""
     experiments, reasons = completed(in_force(as_meant(checked(experiments))))
     experiments, form = as_it_yields(experiments)
     reasons = {**reasons, **({} if form is None else {"presliding": form})}
@@ -110,7 +134,8 @@ def _diagnosed(experiments: ExperimentSet, allowed: Sequence[str], negligible: f
     nothing_nm = _negligible(nominal, channels, negligible)
     quiet = _raw_quiet(channels, negligible)
     loop = along = None
-    if simulation is not None and believed and _hides(channels[0], gaps[0], found, simulation):
+    hidden = simulation is not None and (in_loop or _hides(channels[0], gaps[0], found, simulation))
+    if simulation is not None and believed and hidden and not _swing(found):
         loop = _of_the_loop(nominal, channels[0], found, believed, simulation, allowed, reasons)
     if loop is not None:
         along, channels = channels[0], [sampled(Posterior(loop, len(allowed))), *channels[1:]]
@@ -214,14 +239,14 @@ def _believed(
 
 
 def _hides(along: Sampled, gap: Closed, found: Sequence[Finding], simulation: Simulation) -> bool:
-    """Whether no gap shows along the motion, and noise there is much louder than that of the closed loop.
-
-    A link that swings by itself is no small change of the loop: where it shows along the motion, it is read there.
-    """
-    if any(swings(f.effect) and f.chance >= UNDECIDED for f in found):
-        return False
+    """Whether no gap shows along the motion, and noise there is much louder than that of the closed loop."""
     noise_nm = min(along.posterior.floor, along.posterior.channel.known_floor)
     return gap.before <= FLOORS * gap.floor and simulation.noise_nm < COARSE * noise_nm
+
+
+def _swing(found: Sequence[Finding]) -> bool:
+    """Whether a link swings by itself: that is no small change of the loop, and is read along the motion."""
+    return any(swings(f.effect) and f.chance >= UNDECIDED for f in found)
 
 
 def _values(found: Iterable[Finding]) -> dict[str, dict[str, float]]:
