@@ -261,20 +261,29 @@ def test_concave_curve_below_its_first_pair_is_not_called_stribeck() -> None:
 
 
 @pytest.mark.parametrize(
-    ("elastic_nm", "steady_nm", "first"),
-    [(0.7, 0.1, "inertia_error"), (0.7, 0.7, "joint_elasticity"), (0.1, 0.1, "joint_elasticity")],
+    ("left_nm", "first"),
+    [
+        ({"joint_elasticity": 0.7, "inertia_error": 0.1}, "inertia_error"),
+        ({"joint_elasticity": 0.7, "inertia_error": 0.65}, "joint_elasticity"),  # which leaves half of it, too
+        ({"joint_elasticity": 0.1, "inertia_error": 0.05}, "joint_elasticity"),  # which leaves hardly a gap
+        ({"viscous_nonlinearity": 0.5, "friction_level_error": 0.1}, "friction_level_error"),
+        ({"viscous_nonlinearity": 0.5, "friction_level_error": 0.49}, "viscous_nonlinearity"),
+    ],
 )
-def test_a_link_that_swings_gives_way_to_what_closes_the_loop(
-    monkeypatch: pytest.MonkeyPatch, elastic_nm: float, steady_nm: float, first: str
+def test_the_closed_loop_judges_how_the_recordings_were_read(
+    monkeypatch: pytest.MonkeyPatch, left_nm: dict[str, float], first: str
 ) -> None:
-    """Along a motion an elastic joint passes for a wrong inertia; in closed loop it swings."""
-    told = {"joint_elasticity": elastic_nm, "inertia_error": steady_nm}
+    """An elastic joint passes for a wrong inertia along a motion, and a coarse encoder hides which curve is wrong."""
+    along, other = left_nm
 
-    def diagnosed(_: object, allowed: Sequence[str], __: float) -> SimpleNamespace:
-        name = next(n for n in told if n in allowed)
-        before, after, noise = (Figures(forward_torque_nm=nm) for nm in (1.0, told[name], 0.05))
-        causes = (SimpleNamespace(effect=name),)
-        return SimpleNamespace(verdict="explained", causes=causes, before=before, after=after, noise_floor=noise)
+    def diagnosed(_: object, allowed: Sequence[str], __: float, *, in_loop: bool = False) -> SimpleNamespace:
+        name = along if along in allowed and not in_loop else other
+        before, after = (Figures(forward_torque_nm=nm) for nm in (1.0, left_nm[name]))
+        noise = Figures(inverse_nm=0.2, forward_torque_nm=0.05)
+        return SimpleNamespace(
+            verdict="explained", causes=(SimpleNamespace(effect=name),), before=before, after=after, noise_floor=noise,
+            reasons={"encoder": diagnosis.HIDES} if in_loop else {},
+        )  # fmt: skip
 
     monkeypatch.setattr(diagnosis, "_diagnosed", diagnosed)
     answer = diagnose(cast(ExperimentSet, None))
