@@ -29,6 +29,7 @@ from frictid_hil.config.provenance import git_revision
 from frictid_hil.gap import (
     actuation_channel,
     borne_out,
+    command_timing,
     findings,
     generic,
     how_far,
@@ -74,6 +75,7 @@ TABLES: tuple[tuple[ModuleType, str], ...] = (
     (generic, "REACHES"), (nuisances, "FREE"), (nuisances, "STIFFER"), (actuation_channel, "WITHIN_ROWS"),
     (actuation_channel, "LIMITED"), (diagnosis, "COARSE"), (linear_loop, "CREEP"), (loop_channel, "STANDS_S"),
     (loop_channel, "COUNTS"), (presliding, "CLEARLY"), (residuals, "LEAST_SHARE"),
+    (command_timing, "WRONG"), (command_timing, "HALVED"),
 )  # fmt: skip
 """The tables of the channels."""
 CHANCES = (

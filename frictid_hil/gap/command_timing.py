@@ -65,15 +65,16 @@ def _lateness(controller: Controller, logs: Sequence[tuple[Experiment, Experimen
     Plainly wrong gains would pass for lateness. Small errors of the gains do so little, and on a joint that trails its
     command the two are alike.
     """
-    as_stated, stated = _fitted(_tables(controller, controller, logs)[:, len(GAINS) :])
-    shares: Array = np.zeros(len(GAINS))
-    late, left = as_stated[0], stated
-    for _ in range(ROUNDS):
-        numbers, left = _fitted(_tables(with_gains(controller, shares.tolist()), controller, logs))
-        gains, late = numbers[: len(GAINS)], numbers[len(GAINS)]
-        shares = np.clip((1.0 + shares) * (1.0 + gains) - 1.0, *PLAUSIBLE)
-    plainly = left < HALVED**2 * stated and float(np.max(np.abs(shares))) > WRONG
-    return float(np.clip(late if plainly else as_stated[0], 0.0, 1.0))
+    table = _tables(controller, controller, logs)
+    as_stated, stated = _fitted(table[:, len(GAINS) :])
+    numbers, left = _fitted(table)
+    shares = np.clip(numbers[: len(GAINS)], *PLAUSIBLE)
+    if left > HALVED**2 * stated or float(np.max(np.abs(shares))) < WRONG:
+        return float(np.clip(as_stated[0], 0.0, 1.0))
+    for _ in range(ROUNDS - 1):
+        numbers, _ = _fitted(_tables(with_gains(controller, shares.tolist()), controller, logs))
+        shares = np.clip((1.0 + shares) * (1.0 + numbers[: len(GAINS)]) - 1.0, *PLAUSIBLE)
+    return float(np.clip(numbers[len(GAINS)], 0.0, 1.0))
 
 
 def _fitted(table: Array) -> tuple[Array, float]:
