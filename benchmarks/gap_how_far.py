@@ -26,8 +26,9 @@ import yaml
 from frictid_hil.blind.score import Rate
 from frictid_hil.blind.wide import NOTHING, PRESENT, recorded_again
 from frictid_hil.blind.worlds import write_rows
-from frictid_hil.gap.diagnose import UNDECIDED, diagnose
+from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.gap.findings import EVEN
 
 Plain = Mapping[str, Any]
 
@@ -65,7 +66,7 @@ def looked_at(folder: Path, seed: int, answer: Plain) -> dict[str, Any]:
     low, high = gap["after_interval_95"]["inverse_nm"]
     truth = yaml.safe_load((folder / "truth" / f"{name}.yaml").read_text())
     causes = answer["diagnosis"]["causes"]
-    added = {cause["effect"] for cause in causes if cause["confidence"] >= UNDECIDED}
+    added = {cause["effect"] for cause in causes if cause["confidence"] >= EVEN}
     told = ExperimentSet.load(folder / "cases" / name)
     asked = [(), added] if _just(truth, added) else [()]
     drawn = recorded_again(int(name.removeprefix("case_")), seed, truth["kind"], *asked)
@@ -95,7 +96,7 @@ def _again_nm(told: ExperimentSet, other: ExperimentSet, added: Collection[str])
     other_of = {e.name: e for e in other.experiments}
     mixed = tuple(other_of[e.name] if e.validation else e for e in told.experiments)
     found = diagnose(replace(told, experiments=mixed))
-    same = found.verdict == "explained" and {c.effect for c in found.causes if c.confidence >= UNDECIDED} == added
+    same = found.verdict == "explained" and {c.effect for c in found.causes if c.confidence >= EVEN} == added
     return found.after.inverse_nm if same and found.after.inverse_nm is not None else float("nan")
 
 

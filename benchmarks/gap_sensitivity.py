@@ -24,6 +24,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 from frictid_hil.blind.check import draw_sealed
 from frictid_hil.config.provenance import git_revision
 from frictid_hil.gap import (
@@ -33,6 +35,7 @@ from frictid_hil.gap import (
     findings,
     generic,
     how_far,
+    kinematics,
     linear_loop,
     loop_channel,
     noise,
@@ -40,7 +43,9 @@ from frictid_hil.gap import (
     plainest,
     plant_channel,
     posterior,
+    prepared,
     presliding,
+    quiet,
     residuals,
     verdict,
 )
@@ -59,7 +64,7 @@ LATE: tuple[tuple[ModuleType, str], ...] = (
     (verdict, "STANDS_OUT"), (verdict, "REMAINS"), (verdict, "DOUBTED"), (verdict, "HALF"),
     (verdict, "LISTED"), (verdict, "NEEDED"), (verdict, "CERTAIN"), (verdict, "EVEN"), (verdict, "LEADS"),
     (borne_out, "BOUNCED"), (borne_out, "REFUTED"), (how_far, "COLOUR"), (how_far, "APPEARED"), (how_far, "WINDOW_S"),
-    (diagnosis, "NEGLIGIBLE"), (diagnosis, "LOUD"), (diagnosis, "UNDECIDED"),
+    (quiet, "NEGLIGIBLE"), (quiet, "LOUD"), (diagnosis, "UNDECIDED"),
 )  # fmt: skip
 """What is said of a posterior."""
 SEARCHED: tuple[tuple[ModuleType, str], ...] = (
@@ -75,7 +80,7 @@ TABLES: tuple[tuple[ModuleType, str], ...] = (
     (generic, "REACHES"), (nuisances, "FREE"), (nuisances, "STIFFER"), (actuation_channel, "WITHIN_ROWS"),
     (actuation_channel, "LIMITED"), (diagnosis, "COARSE"), (linear_loop, "CREEP"), (loop_channel, "STANDS_S"),
     (loop_channel, "COUNTS"), (presliding, "CLEARLY"), (residuals, "LEAST_SHARE"),
-    (command_timing, "WRONG"), (command_timing, "HALVED"),
+    (command_timing, "HALVED"),
 )  # fmt: skip
 """The tables of the channels."""
 CHANCES = (
@@ -156,17 +161,17 @@ def all_answers(case: Path, tables: bool, only: frozenset[str]) -> dict[str, Ans
                 answers[what] = _answer(experiments)
 
     with ExitStack() as held:
-        for name in ("fit_kinematics", "_believed"):
-            held.enter_context(put(diagnosis, name, once(getattr(diagnosis, name))))
-        held.enter_context(put(diagnosis, "Replay", once(Replay, lambda told: repr(told.nominal))))
+        held.enter_context(put(prepared, "fit_kinematics", once(kinematics.fit_kinematics)))
+        held.enter_context(put(prepared, "believed_joint", once(prepared.believed_joint, as_recorded)))
+        held.enter_context(put(prepared, "Replay", once(Replay, as_recorded)))
         answers["as it is"] = _answer(experiments)
         if tables:
             vary(TABLES)
         for name in ("plant_channel", "actuation_channel", "tracking_channel"):
-            held.enter_context(put(diagnosis, name, once(getattr(diagnosis, name))))
-        held.enter_context(put(diagnosis, "Posterior", prepared()))
+            held.enter_context(put(diagnosis, name, once(getattr(diagnosis, name), library)))
+        held.enter_context(put(diagnosis, "Posterior", same_tables()))
         vary(SEARCHED)
-        held.enter_context(put(diagnosis, "sampled", once(findings.sampled, lambda one: one.channel.name)))
+        held.enter_context(put(diagnosis, "sampled", once(findings.sampled, lambda one: columns(one.channel))))
         vary(LATE)
     return answers
 
@@ -183,14 +188,31 @@ def once(function: Any, key: Callable[..., object] = lambda *told: len(told)) ->
     return same
 
 
-def prepared() -> Callable[[Channel, int], Posterior]:
+def as_recorded(experiments: ExperimentSet, *_: object) -> tuple[str, float]:
+    """What tells one set of a joint from another: its beliefs, and when its commands came into force."""
+    commands = (e.position_command_rad for e in experiments.experiments)
+    return repr(experiments.nominal), float(sum(np.abs(c).sum() for c in commands if c is not None))
+
+
+def library(*told: Any) -> tuple[str, ...]:
+    """The effects that a channel may use: of its arguments, the one that holds names alone."""
+    names = (one for one in told if isinstance(one, (list, tuple)) and one and isinstance(one[0], str))
+    return tuple(next(names, ()))
+
+
+def columns(channel: Channel) -> tuple[str, int, float]:
+    """What tells a channel from another one of the same joint."""
+    return channel.name, len(channel.candidates), float(sum(np.abs(log.y).sum() for log in channel.logs))
+
+
+def same_tables() -> Callable[[Channel, int], Posterior]:
     """A posterior as new, whose tables are those of the first one of the same channel."""
-    known: dict[str, Posterior] = {}
+    known: dict[tuple[str, int, float], Posterior] = {}
 
     def anew(channel: Channel, library: int) -> Posterior:
-        if channel.name not in known:
-            known[channel.name] = Posterior(channel, library)
-        again = copy.copy(known[channel.name])
+        if columns(channel) not in known:
+            known[columns(channel)] = Posterior(channel, library)
+        again = copy.copy(known[columns(channel)])
         again.begin(library)
         return again
 
@@ -198,7 +220,7 @@ def prepared() -> Callable[[Channel, int], Posterior]:
 
 
 def _answer(experiments: ExperimentSet) -> Answer:
-    told = diagnosis.diagnose(experiments, negligible=diagnosis.NEGLIGIBLE)
+    told = diagnosis.diagnose(experiments, negligible=quiet.NEGLIGIBLE)
     named = told.causes and told.verdict in ("explained", "ambiguous")
     return told.verdict, told.causes[0].effect if named else told.verdict
 

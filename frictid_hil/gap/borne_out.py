@@ -48,8 +48,17 @@ class Loop:
         return max(self.before_nm**2 - self.floor_nm**2, self.floor_nm**2)
 
 
-def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[Verdict, str | None]:
-    """The verdict as far as the closed loop bears it out, and what to tell of that.
+@dataclass(frozen=True, slots=True)
+class BorneOut:
+    """What the closed loop makes of a verdict."""
+
+    said: Verdict  # as far as it bears the verdict out
+    told: str | None  # what to tell of that; None where nothing changed
+    idle: frozenset[str]  # causes that bring the simulated joint no nearer
+
+
+def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> BorneOut:
+    """The verdict as far as the closed loop bears it out.
 
     ``open_along``: the causes leave half of the visible gap along the measured motion.
 
@@ -68,37 +77,83 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
         if gap_nm**2 - again[1] ** 2 > REMAINS**2 * loop.visible:
             loop, (kept, gap_nm, beside) = whole, again
     refuted = _refuted(said, values, beside, gap_nm, loop)
-    if not refuted and said.word == "unknown" and any(swings(name) for name in values):
-        return _rescued(said, values, kept, loop)
-    open_still = _open(gap_nm, loop)
-    read = {f.effect for f in said.named if f.where == READ_DIRECTLY or of_the_drive(f)}
-    shows = gap_nm > FLOORS * loop.floor_nm and (not kept or gap_nm > loop.negligible_nm)
-    leans = bool(kept and refuted)
-    if (open_along or leans) and open_still and shows and not read and said.word != "unknown":
-        # However small the gap along the motion is in practice: these causes are not what makes it. Nor are they where
-        # they describe it only with one that the loop refutes.
-        return Verdict("unknown", said.named, LITTLE if kept else NO_NEARER), _told(kept, refuted, loop, gap_nm)
-    if not refuted:
-        return (_doubted(said) if kept and not read and doubtful else said), None
-    stands = [f for f in said.named if f.effect not in refuted]
-    falls = [f.at_most(REFUTED) for f in said.named if f.effect in refuted]
-    if said.word != "unknown" and said.named[0].effect not in refuted:
-        return replace(said, named=(*stands, *falls)), _told(kept, refuted, loop, gap_nm)
+    idle = frozenset(values) - set(kept) if kept else frozenset[str]()
+    if refuted:
+        return BorneOut(*_without(said, refuted, kept, gap_nm, loop, open_along=open_along), idle)
+    if said.word == "unknown":
+        return BorneOut(*_closed(said, values, kept, gap_nm, loop), idle)
+    if open_along and _open(gap_nm, loop) and _shows(kept, gap_nm, loop) and not _read(said):
+        # However small the gap along the motion is in practice: these causes are not what makes it.
+        return BorneOut(_none_of_these(said, kept), _told(kept, refuted, loop, gap_nm), idle)
+    return BorneOut(_doubted(said) if kept and doubtful and not _read(said) else said, None, idle)
+
+
+def _without(
+    said: Verdict, refuted: set[str], kept: Sequence[str], gap_nm: float, loop: Loop, *, open_along: bool
+) -> tuple[Verdict, str]:
+    """The verdict less the causes that the loop refutes, and what to tell of that."""
+    told = _told(kept, refuted, loop, gap_nm)
+    known = said.word != "unknown"
+    if known and (open_along or kept) and _open(gap_nm, loop) and _shows(kept, gap_nm, loop) and not _read(said):
+        # Causes that describe the gap only with one that the loop refutes are not what makes it.
+        return _none_of_these(said, kept), told
+    falls = [f for f in said.named if f.effect in refuted]
+    stands = [_instead_of(f, falls) for f in said.named if f.effect not in refuted]
+    falls = [f.at_most(REFUTED) for f in falls]
+    if known and said.named[0].effect not in refuted:
+        return replace(said, named=(*stands, *falls)), told
     stands.sort(key=lambda f: kept.index(f.effect) if f.effect in kept else len(kept))
     stands = [f if f.where == READ_DIRECTLY else f.at_most(DOUBTED) for f in stands]
-    stands, gap_nm = _refined(stands, {name: values[name] for name in kept}, loop, gap_nm)
+    helping = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in stands if f.effect in kept}
+    stands, gap_nm = _refined(stands, helping, loop, gap_nm)
     told = _told(kept, refuted, loop, gap_nm)
     may_stay = BOUNCED if any(swings(name) for name in kept) else REMAINS
-    left = max(0.0, gap_nm**2 - loop.floor_nm**2)
-    if (kept and left <= may_stay**2 * loop.visible) or any(f.where == READ_DIRECTLY for f in stands):
+    if (kept and _leaves(gap_nm, loop) <= may_stay**2) or any(f.where == READ_DIRECTLY for f in stands):
         # What is read from the positions themselves is there, whatever the loop makes of the others.
         return Verdict("explained", (*stands, *falls)), told
     return Verdict("unknown", (*stands, *falls), said.place or NO_NEARER), told
 
 
+def _closed(
+    said: Verdict, values: Effects, kept: Sequence[str], gap_nm: float, loop: Loop
+) -> tuple[Verdict, str | None]:
+    """What has no name along the motion is no part of the gap where the causes close the loop."""
+    shows = loop.before_nm > FLOORS * loop.floor_nm
+    if kept and shows and _leaves(gap_nm, loop) <= REMAINS**2 and not said.place.startswith("actuation"):
+        named = sorted(said.named, key=lambda f: f.effect not in kept)
+        return _doubted(Verdict("explained", tuple(named))), _told(kept, set(), loop, gap_nm)
+    return _rescued(said, values, kept, loop) if any(swings(name) for name in values) else (said, None)
+
+
+def _none_of_these(said: Verdict, kept: Sequence[str]) -> Verdict:
+    return Verdict("unknown", said.named, LITTLE if kept else NO_NEARER)
+
+
+def _read(said: Verdict) -> bool:
+    """Whether a cause is seen by itself, in positions or between demand and torque."""
+    return any(f.where == READ_DIRECTLY or of_the_drive(f) for f in said.named)
+
+
+def _shows(kept: Sequence[str], gap_nm: float, loop: Loop) -> bool:
+    """Whether what causes leave is a gap; where none helps, also one that means nothing to the user."""
+    return gap_nm > FLOORS * loop.floor_nm and (not kept or gap_nm > loop.negligible_nm)
+
+
+def _instead_of(cause: Finding, falls: Sequence[Finding]) -> Finding:
+    """A cause that gains what the recordings gave to rivals that the loop refutes, up to ``DOUBTED``."""
+    gained = sum(f.chance for f in falls if f.effect in cause.rivals or cause.effect in f.rivals)
+    chance, confidence = (max(c, min(DOUBTED, c + gained)) for c in (cause.chance, cause.confidence))
+    return replace(cause, chance=chance, confidence=confidence)
+
+
+def _leaves(gap_nm: float, loop: Loop) -> float:
+    """Part of the visible gap's power that stays."""
+    return max(0.0, gap_nm**2 - loop.floor_nm**2) / loop.visible
+
+
 def _open(gap_nm: float, loop: Loop) -> bool:
     """Whether half of the visible gap stays."""
-    return gap_nm**2 - loop.floor_nm**2 > HALF**2 * loop.visible
+    return _leaves(gap_nm, loop) > HALF**2
 
 
 def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm: float, loop: Loop) -> set[str]:

@@ -18,7 +18,6 @@ from frictid_hil.gap.residuals import LowPass, demand_of, demand_parts, held, un
 
 ROUNDS = 3  # times that errors of the gains are fitted: a limited demand, or that of a cascade, is not linear in them
 PLAUSIBLE = (-0.9, 4.0)  # errors of a gain that are sought
-WRONG = 0.1  # error of a gain, over it, from which on it is plainly wrong
 HALVED = 0.5  # torque that other gains leave over what the stated ones do, above which they are none
 FASTEST = 1.05  # rows of the log to a control tick, above which it holds what the controller never saw
 
@@ -62,19 +61,19 @@ def _shifted(e: Experiment, late: float) -> Experiment:
 def _lateness(controller: Controller, logs: Sequence[tuple[Experiment, Experiment | None]]) -> float:
     """Rows by which commands came into force later than they were sent, as the torques fit best; from 0 to 1.
 
-    Plainly wrong gains would pass for lateness. Small errors of the gains do so little, and on a joint that trails its
-    command the two are alike.
+    Wrong gains would pass for lateness: others are taken where they leave much less. Where they leave about as much,
+    the stated ones stand, as on a joint that trails its command a gain and a delay are alike.
     """
     table = _tables(controller, controller, logs)
-    as_stated, stated = _fitted(table[:, len(GAINS) :])
-    numbers, left = _fitted(table)
-    shares = np.clip(numbers[: len(GAINS)], *PLAUSIBLE)
-    if left > HALVED**2 * stated or float(np.max(np.abs(shares))) < WRONG:
-        return float(np.clip(as_stated[0], 0.0, 1.0))
-    for _ in range(ROUNDS - 1):
-        numbers, _ = _fitted(_tables(with_gains(controller, shares.tolist()), controller, logs))
+    numbers, stated = _fitted(table[:, len(GAINS) :])
+    late = numbers[0]
+    shares = np.zeros(len(GAINS))
+    for _ in range(ROUNDS):
+        numbers, left = _fitted(_tables(with_gains(controller, shares.tolist()), controller, logs))
+        if left <= HALVED**2 * stated:
+            late = numbers[len(GAINS)]
         shares = np.clip((1.0 + shares) * (1.0 + numbers[: len(GAINS)]) - 1.0, *PLAUSIBLE)
-    return float(np.clip(numbers[len(GAINS)], 0.0, 1.0))
+    return float(np.clip(late, 0.0, 1.0))
 
 
 def _fitted(table: Array) -> tuple[Array, float]:

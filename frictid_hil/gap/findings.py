@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -184,6 +184,11 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
             )
         )
     return sorted(result, key=lambda f: -f.size)
+
+
+def told_numbers(found: Iterable[Finding]) -> dict[str, dict[str, float]]:
+    """The numbers of those causes that have some, by effect and parameter."""
+    return {f.effect: {name: v.value for name, v in f.parameters.items()} for f in found if f.parameters}
 
 
 def either_way(channels: Sequence[Sampled]) -> list[str]:

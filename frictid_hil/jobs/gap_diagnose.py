@@ -15,12 +15,12 @@ from frictid_hil.config.write import dump
 from frictid_hil.errors import FrictidError, UsageError
 from frictid_hil.files import made_folder, part_of_path, refuse_overwriting, write_whole
 from frictid_hil.gap.arm import ArmFindings
-from frictid_hil.gap.diagnose import NEGLIGIBLE
 from frictid_hil.gap.diagnose import diagnose as find_causes
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, why_not
 from frictid_hil.gap.profiles import missing_torque
+from frictid_hil.gap.quiet import NEGLIGIBLE
 from frictid_hil.jobs.gap.closed_loop import side_by_side
 from frictid_hil.jobs.gap.draft import drafted
 from frictid_hil.jobs.gap.export_mujoco import export_mujoco

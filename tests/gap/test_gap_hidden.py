@@ -11,9 +11,10 @@ import pytest
 
 from frictid_hil.blind.generator import Assignment, draw_case, write_case
 from frictid_hil.config.nominal import Tolerance
-from frictid_hil.gap.diagnose import _believed, _simulation, diagnose
+from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
 from frictid_hil.gap.plant_channel import plant_channel
+from frictid_hil.gap.prepared import believed_joint, simulated_joint
 from frictid_hil.gap.residuals import recordings, rms
 from frictid_hil.gap.tolerances import Tolerances
 from frictid_hil.gap.verdict import DOUBTED
@@ -153,15 +154,15 @@ def test_a_log_that_lacks_ticks_folds_the_jumps_of_a_coarse_encoders_torque_into
     made = gap_sets.make(nominal=replace(gap_sets.NOMINAL, encoder_resolution_rad=5e-4))
     thin = replace(made, experiments=tuple(_rows_kept(e, 5) for e in made.experiments))
     logs = recordings(thin)
-    smooth, stepped = _believed(thin, _simulation(thin, logs))
+    smooth, stepped = believed_joint(thin, simulated_joint(thin, logs))
     found = [plant_channel(thin.nominal, logs, (), (), smooth, steps) for steps in ((), stepped)]
     floors = [channel.known_floor for channel in found if channel is not None]
     assert found[1] is not None
     shown = rms(np.concatenate([log.y[log.told] for log in found[1].logs]))
     assert floors[0] < 0.85 * shown and 0.9 * shown < floors[1] < 1.25 * shown
-    assert _believed(made, _simulation(made, recordings(made)))[1] == ()
+    assert believed_joint(made, simulated_joint(made, recordings(made)))[1] == ()
     # An encoder that nobody states has no steps; noise of the position itself stays.
     unstated = replace(thin, nominal=replace(thin.nominal, encoder_resolution_rad=None))
-    smooth, stepped = _believed(unstated, _simulation(unstated, logs))
+    smooth, stepped = believed_joint(unstated, simulated_joint(unstated, logs))
     alone, both = (plant_channel(unstated.nominal, logs, (), (), smooth, steps) for steps in ((), stepped))
     assert alone is not None and both is not None and 0.0 < alone.known_floor == both.known_floor

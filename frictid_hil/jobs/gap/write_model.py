@@ -14,8 +14,8 @@ from frictid_hil.errors import FrictidError
 from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.diagnose import UNDECIDED
 from frictid_hil.gap.diagnosis import Cause, Diagnosis
+from frictid_hil.gap.findings import EVEN
 from frictid_hil.jobs.gap.closed_loop import closed_loop_gap, fitted, gap_of, why_no_closed_loop
 from frictid_hil.jobs.gap.draft import SLIP_RAD
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, postures
@@ -114,7 +114,7 @@ def applied(found: Diagnosis, *, apply: bool) -> dict[str, dict[str, float]]:
 
 def likely(found: Diagnosis) -> Sequence[Cause]:
     """The causes at an even chance or better, or the first: the size of the others is hardly more than a guess."""
-    return [cause for cause in found.causes if cause.confidence >= UNDECIDED] or found.causes[:1]
+    return [cause for cause in found.causes if cause.confidence >= EVEN] or found.causes[:1]
 
 
 def within(effect: str, told: Mapping[str, float]) -> dict[str, float]:
