@@ -80,7 +80,7 @@ TABLES: tuple[tuple[ModuleType, str], ...] = (
     (generic, "REACHES"), (nuisances, "FREE"), (nuisances, "STIFFER"), (actuation_channel, "WITHIN_ROWS"),
     (actuation_channel, "LIMITED"), (diagnosis, "COARSE"), (linear_loop, "CREEP"), (loop_channel, "STANDS_S"),
     (loop_channel, "COUNTS"), (presliding, "CLEARLY"), (residuals, "LEAST_SHARE"),
-    (command_timing, "HALVED"),
+    (command_timing, "HALVED"), (command_timing, "ALIKE"),
 )  # fmt: skip
 """The tables of the channels."""
 CHANCES = (

@@ -6,6 +6,7 @@ the next one, or sent a little later. With a stiff loop a millisecond of that is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -19,6 +20,7 @@ from frictid_hil.gap.residuals import LowPass, demand_of, demand_parts, held, un
 ROUNDS = 3  # times that errors of the gains are fitted: a limited demand, or that of a cascade, is not linear in them
 PLAUSIBLE = (-0.9, 4.0)  # errors of a gain that are sought
 HALVED = 0.5  # torque that other gains leave over what the stated ones do, above which they are none
+ALIKE = 0.03  # part of what a late command makes that other gains do not, below which the two are alike
 FASTEST = 1.05  # rows of the log to a control tick, above which it holds what the controller never saw
 
 
@@ -61,19 +63,27 @@ def _shifted(e: Experiment, late: float) -> Experiment:
 def _lateness(controller: Controller, logs: Sequence[tuple[Experiment, Experiment | None]]) -> float:
     """Rows by which commands came into force later than they were sent, as the torques fit best; from 0 to 1.
 
-    Wrong gains would pass for lateness: others are taken where they leave much less. Where they leave about as much,
-    the stated ones stand, as on a joint that trails its command a gain and a delay are alike.
+    Wrong gains would pass for lateness: others are taken where they leave much less. On a joint that trails its command
+    a gain and a delay are alike, and the stated gains stand.
     """
     table = _tables(controller, controller, logs)
     numbers, stated = _fitted(table[:, len(GAINS) :])
     late = numbers[0]
     shares = np.zeros(len(GAINS))
     for _ in range(ROUNDS):
-        numbers, left = _fitted(_tables(with_gains(controller, shares.tolist()), controller, logs))
-        if left <= HALVED**2 * stated:
+        numbers, left = _fitted(table)
+        if left <= HALVED**2 * stated and _apart(table) > ALIKE:
             late = numbers[len(GAINS)]
         shares = np.clip((1.0 + shares) * (1.0 + numbers[: len(GAINS)]) - 1.0, *PLAUSIBLE)
+        table = _tables(with_gains(controller, shares.tolist()), controller, logs)
     return float(np.clip(late, 0.0, 1.0))
+
+
+def _apart(table: Array) -> float:
+    """Part of the late command's column that gains and a constant do not make, over the column."""
+    late = len(GAINS)
+    _, left = _fitted(np.column_stack([np.delete(table[:, :-1], late, axis=1), table[:, late]]))
+    return math.sqrt(left / max(float(table[:, late] @ table[:, late]), 1e-300))
 
 
 def _fitted(table: Array) -> tuple[Array, float]:

@@ -61,6 +61,11 @@ class Reading:
     reasons: Mapping[str, str]  # what cannot be told, by name
     along: Sampled | None = None  # the plant channel where the loop channel stands in its place
 
+    @property
+    def measured(self) -> Sequence[Sampled]:
+        """The channels along the measured motion."""
+        return self.channels if self.along is None else [self.along, *self.channels[1:]]
+
 
 def diagnose(
     experiments: ExperimentSet, *, library: Collection[str] | None = None, negligible: float = NEGLIGIBLE
@@ -154,8 +159,9 @@ def _best(joint: Prepared, along: Reading) -> Reading:
     if joint.simulation is None:
         return along
     plant, gap = along.channels[0].posterior, along.gaps[0]
-    hides = joint.simulation.noise_nm < COARSE * min(plant.floor, plant.channel.known_floor)
-    return (hides and gap.before <= FLOORS * gap.floor and _in_loop(joint, along)) or along
+    louder = joint.simulation.noise_nm < COARSE * min(plant.floor, plant.channel.known_floor)
+    loop = _in_loop(joint, along) if louder and gap.before <= FLOORS * gap.floor else None
+    return along if loop is None else loop
 
 
 def _in_loop(joint: Prepared, along: Reading) -> Reading | None:
@@ -182,8 +188,7 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     """What is said of one reading."""
     channels, gaps, reasons = reading.channels, reading.gaps, dict(reading.reasons)
     nothing_nm = negligible_nm(joint.nominal, channels, negligible)
-    plain = [reading.along, *channels[1:]] if reading.along is not None else channels
-    quiet = quiet_before_any_filter(plain, negligible)
+    quiet = quiet_before_any_filter(reading.measured, negligible)
     if quiet and joint.simulation is not None:
         quiet = quiet_in_the_loop(joint.simulation, reading.found, channels, gaps, nothing_nm)
     said = verdict(reading.found, channels, gaps, nothing_nm, quiet, joint.simulation is not None)
@@ -203,8 +208,7 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
 
 def _open_along(reading: Reading) -> bool:
     """Whether likely causes leave half of a visible gap of the joint itself, along its motion or in its loop."""
-    plain = [reading.channels[0] if reading.along is None else reading.along, *reading.channels[1:]]
-    every = (c.posterior.channel for c in plain)
+    every = (c.posterior.channel for c in reading.measured)
     loose = {c.name for c in every if c.of_the_joint or c.between_rows} | {"loop"}
     return any(gap.channel in loose and stays(gap, HALF, floors=1.0) for gap in reading.gaps)
 

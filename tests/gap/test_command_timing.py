@@ -48,9 +48,10 @@ def test_a_command_comes_when_it_did(late: float) -> None:
 
 @pytest.mark.parametrize("gain", ["kp_nm_per_rad", "kd_nm_s_per_rad"])
 @pytest.mark.parametrize("late", [0.1, 0.5])
-def test_a_gain_that_is_plainly_wrong_is_no_lateness(late: float, gain: str) -> None:
+@pytest.mark.parametrize("times", [1.05, 1.4])
+def test_a_wrong_gain_is_no_lateness(late: float, gain: str, times: float) -> None:
     made = recorded(late, shaken_rad=0.02)
-    stated = replace(LOOP, rate_hz=1000.0, **{gain: 1.4 * getattr(LOOP, gain)})
+    stated = replace(LOOP, rate_hz=1000.0, **{gain: times * getattr(LOOP, gain)})
     raw = made.experiments[0].position_command_rad
     found = in_force(replace(made, nominal=replace(made.nominal, controller=stated))).experiments[0]
     assert raw is not None and found.position_command_rad is not None

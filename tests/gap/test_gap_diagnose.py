@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import gap_sets
 import numpy as np
@@ -276,15 +276,24 @@ def test_the_closed_loop_judges_how_the_recordings_were_read(
     """An elastic joint passes for a wrong inertia along a motion, and a coarse encoder hides which curve is wrong."""
     along, other = left_nm
 
-    def diagnosed(_: object, allowed: Sequence[str], __: float, *, in_loop: bool = False) -> SimpleNamespace:
-        name = along if along in allowed and not in_loop else other
+    def along_motion(_: object, allowed: Sequence[str]) -> Any:
+        return diagnosis.Reading(tuple(allowed), (), (), (), {"name": along if along in allowed else other})
+
+    def in_loop(_: object, reading: Any) -> Any:
+        return replace(reading, reasons={"name": other, "encoder": diagnosis.HIDES})
+
+    def answered(_: object, reading: Any, __: float) -> SimpleNamespace:
+        name = reading.reasons["name"]
         before, after = (Figures(forward_torque_nm=nm) for nm in (1.0, left_nm[name]))
-        noise = Figures(inverse_nm=0.2, forward_torque_nm=0.05)
         return SimpleNamespace(
-            verdict="explained", causes=(SimpleNamespace(effect=name),), before=before, after=after, noise_floor=noise,
-            reasons={"encoder": diagnosis.HIDES} if in_loop else {},
+            verdict="explained", causes=(SimpleNamespace(effect=name),), before=before, after=after,
+            noise_floor=Figures(inverse_nm=0.2, forward_torque_nm=0.05), reasons=reading.reasons,
         )  # fmt: skip
 
-    monkeypatch.setattr(diagnosis, "_diagnosed", diagnosed)
+    monkeypatch.setattr(diagnosis, "prepared", lambda *_: None)
+    monkeypatch.setattr(diagnosis, "_best", lambda _, reading: reading)
+    for name, stand_in in (("_along", along_motion), ("_in_loop", in_loop), ("_answer", answered)):
+        monkeypatch.setattr(diagnosis, name, stand_in)
     answer = diagnose(cast(ExperimentSet, None))
     assert answer.causes[0].effect == first
+    assert ("link" in answer.reasons) is (first == "inertia_error")

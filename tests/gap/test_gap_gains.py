@@ -83,3 +83,23 @@ def test_the_first_cause_makes_most_where_it_shows_most(gain: float, guessed: bo
     simulation = cast(Simulation, SimpleNamespace(noise_nm=0.1, made_nm=lambda each: [0.1, 1.6]))
     said = diagnosing._ranked(Verdict("explained", causes), simulation, [], guessed=guessed)
     assert said.named[0] is causes[first]
+
+
+def test_what_brings_the_joint_no_nearer_counts_along_the_motion_alone() -> None:
+    """A presliding hysteresis that changed much in closed loop stood before the torque limit that closed it."""
+    value = {"any": Value(1.0, 0.9, 1.1)}
+    causes = tuple(
+        Finding(name, chance, chance, size, 0.0, value, (), "plant")
+        for name, chance, size in (
+            ("presliding_hysteresis", 0.9, 1.5),
+            ("torque_saturation", 0.9, 1.0),
+            ("stribeck", 0.4, 9.0),
+        )
+    )
+    simulation = cast(Simulation, SimpleNamespace(noise_nm=0.1, made_nm=lambda each: [1.6, 0.9, 0.2]))
+    said = Verdict("explained", causes)
+    idle = {"presliding_hysteresis", "stribeck"}
+    named = diagnosing._ranked(said, simulation, [], guessed=False).named
+    assert [f.effect for f in named] == ["presliding_hysteresis", "stribeck", "torque_saturation"]
+    named = diagnosing._ranked(said, simulation, [], guessed=False, idle=idle).named
+    assert [f.effect for f in named] == ["torque_saturation", "presliding_hysteresis", "stribeck"]
