@@ -70,8 +70,8 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> BorneOu
     values = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in said.named}
     rivals = {f.effect: f.rivals for f in said.named}
     kept, gap_nm, beside = _chosen(values, rivals, loop)
-    doubtful = _open(gap_nm, loop)
-    if loop.tolerated and gap_nm**2 - loop.floor_nm**2 > REMAINS**2 * loop.visible:
+    doubtful = _stays(HALF, gap_nm, loop)
+    if loop.tolerated and _stays(REMAINS, gap_nm, loop):
         whole = loop.with_tolerances()
         again = _chosen(values, rivals, whole)
         if gap_nm**2 - again[1] ** 2 > REMAINS**2 * loop.visible:
@@ -82,7 +82,7 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> BorneOu
         return BorneOut(*_without(said, refuted, kept, gap_nm, loop, open_along=open_along), idle)
     if said.word == "unknown":
         return BorneOut(*_closed(said, values, kept, gap_nm, loop), idle)
-    if open_along and _open(gap_nm, loop) and _shows(kept, gap_nm, loop) and not _read(said):
+    if open_along and _stays(HALF, gap_nm, loop) and _shows(kept, gap_nm, loop) and not _read(said):
         # However small the gap along the motion is in practice: these causes are not what makes it.
         return BorneOut(_none_of_these(said, kept), _told(kept, refuted, loop, gap_nm), idle)
     return BorneOut(_doubted(said) if kept and doubtful and not _read(said) else said, None, idle)
@@ -94,7 +94,7 @@ def _without(
     """The verdict less the causes that the loop refutes, and what to tell of that."""
     told = _told(kept, refuted, loop, gap_nm)
     known = said.word != "unknown"
-    if known and (open_along or kept) and _open(gap_nm, loop) and _shows(kept, gap_nm, loop) and not _read(said):
+    if known and (open_along or kept) and _stays(HALF, gap_nm, loop) and _shows(kept, gap_nm, loop) and not _read(said):
         # Causes that describe the gap only with one that the loop refutes are not what makes it.
         return _none_of_these(said, kept), told
     falls = [f for f in said.named if f.effect in refuted]
@@ -108,7 +108,7 @@ def _without(
     stands, gap_nm = _refined(stands, helping, loop, gap_nm)
     told = _told(kept, refuted, loop, gap_nm)
     may_stay = BOUNCED if any(swings(name) for name in kept) else REMAINS
-    if (kept and _leaves(gap_nm, loop) <= may_stay**2) or any(f.where == READ_DIRECTLY for f in stands):
+    if (kept and not _stays(may_stay, gap_nm, loop)) or any(f.where == READ_DIRECTLY for f in stands):
         # What is read from the positions themselves is there, whatever the loop makes of the others.
         return Verdict("explained", (*stands, *falls)), told
     return Verdict("unknown", (*stands, *falls), said.place or NO_NEARER), told
@@ -119,7 +119,7 @@ def _closed(
 ) -> tuple[Verdict, str | None]:
     """What has no name along the motion is no part of the gap where the causes close the loop."""
     shows = loop.before_nm > FLOORS * loop.floor_nm
-    if kept and shows and _leaves(gap_nm, loop) <= REMAINS**2 and not said.place.startswith("actuation"):
+    if kept and shows and not _stays(REMAINS, gap_nm, loop) and not said.place.startswith("actuation"):
         named = sorted(said.named, key=lambda f: f.effect not in kept)
         return _doubted(Verdict("explained", tuple(named))), _told(kept, set(), loop, gap_nm)
     return _rescued(said, values, kept, loop) if any(swings(name) for name in values) else (said, None)
@@ -146,14 +146,9 @@ def _instead_of(cause: Finding, falls: Sequence[Finding]) -> Finding:
     return replace(cause, chance=chance, confidence=confidence)
 
 
-def _leaves(gap_nm: float, loop: Loop) -> float:
-    """Part of the visible gap's power that stays."""
-    return max(0.0, gap_nm**2 - loop.floor_nm**2) / loop.visible
-
-
-def _open(gap_nm: float, loop: Loop) -> bool:
-    """Whether half of the visible gap stays."""
-    return _leaves(gap_nm, loop) > HALF**2
+def _stays(part: float, gap_nm: float, loop: Loop) -> bool:
+    """Whether more than a part of the visible gap stays."""
+    return gap_nm**2 - loop.floor_nm**2 > part**2 * loop.visible
 
 
 def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm: float, loop: Loop) -> set[str]:
@@ -174,7 +169,7 @@ def _rescued(said: Verdict, values: Effects, kept: Sequence[str], loop: Loop) ->
     helping = {name: values[name] for name in values if name in kept or swings(name)}
     before = [f for f in said.named if f.effect in helping]
     stands, closer_nm = _refined(before, helping, loop, loop.gap_nm(helping))
-    if stands == before or closer_nm**2 - loop.floor_nm**2 > BOUNCED**2 * loop.visible:
+    if stands == before or _stays(BOUNCED, closer_nm, loop):
         return said, None
     rest = [f for f in said.named if f.effect not in helping]
     return _doubted(Verdict("explained", (*stands, *rest))), _told(list(helping), set(), loop, closer_nm)
@@ -198,7 +193,7 @@ def _chosen(
     A rival stands in the place of a cause: it is tried there, not beside it.
     """
     kept, gap_nm = _added(values, rivals, loop)
-    if gap_nm**2 - loop.floor_nm**2 > REMAINS**2 * loop.visible:
+    if _stays(REMAINS, gap_nm, loop):
         # A wrong gain and a wrong inertia may each take a joint further off, and together bring it home.
         others, left_nm = _taken_off(values, loop)
         if gap_nm**2 - left_nm**2 > REMAINS**2 * loop.visible:
