@@ -60,12 +60,36 @@ SAMPLED = {  # function: the parameters that the whole check takes; ``--long`` t
     "test_an_averaging_filter_of_150_ms_ends_in_the_gates_refusal": {"batch"},
     "test_twice_stops_quickly": {"2-15"},
     "test_an_effect_is_recorded_named_and_closed": {"torque_bias"},
+    "test_the_commands_of_a_guide_run": {"connect-a-drive", "diagnose", "recalibrate", "replay", "robot-file"},
+    "test_a_fault_leaves_nothing_moving_nothing_lost_and_no_wrong_curve": {
+        *("calibrate-cycles-bus off", "calibrate-cycles-node reboots", "calibrate-move-position jumps a turn"),
+        *("calibrate-cycles-torque times 1.5", "calibrate-rehearsal-drive faults", "calibrate-rehearsal-send os"),
+    },
+    "test_every_ending": {"within the policy", "drifted", "changed too much", "encoder lost", "power lost"},
+    "test_faults_on_a_pseudo_terminal": {
+        *("alarm@60:4107", "bad_crc@40", "hold@60", "lost_frame@50x2", "merge@0:0.01", "nak@2", "unplug@40"),
+    },
+    "test_page_draws_without_errors": {"calibration", "gap", "recalibration"},
+    "test_the_docs_show_the_page_as_it_is": {"calibration-size0", "gap-size3", "arm-size4"},
+    "test_the_contrast_holds_in_the_dark_too": {"gap"},
+    "test_a_curve_concave_below_its_first_pair_is_no_stribeck_without_a_warning": {
+        *("speeds0-torques0-closed loop", "speeds1-torques1-no controller"),
+    },
+    "test_what_wins_within_its_logs_and_loses_on_others_is_not_reported": {
+        *("_bias_of_one_half-closed loop", "_flipped_ripple-no controller"),
+    },
+    "test_a_cause_that_steps_hide_is_found_in_the_loops_torque": {"gravity_error-error_share-0.1"},
+    "test_a_stop_on_request_stays_within_the_planned_travel_and_in_time": {"40", "118", "170", "290"},
+    "test_the_exported_joint_moves_as_in_our_own_simulator": {"backlash", "stribeck", "torque_ripple", "velocity_lag"},
+    "test_function_a_reaches_its_level_on_other_friction": {"0-0", "1-3", "3-4", "5-2"},
 }
 LONG = {  # functions that ``--long`` alone runs: what they show is shown by others in a smaller way
     "test_behind_another_authors_canopen_on_that_link",
     "test_can_fd_carries_them_faster_and_its_log_replays",
     "test_can_fd_changes_no_figure",
     "test_a_round_of_the_soak_keeps_nothing",
+    "test_the_loop_is_timed_beside_stock_canopen_and_beside_an_empty_one",
+    "test_the_table_does_what_a_can_run_with_the_same_delay_does_within_three_points",
     "test_an_error_of_the_belief_that_makes_four_floors_in_the_loop_is_named_small_as_it_is_along_the_motion",
     "test_what_was_left_out_is_told_with_its_reason",
     "test_friction_is_found_over_it",
