@@ -36,6 +36,7 @@ class Loop:
     negligible_nm: float = 0.0  # gap that means nothing to the user
     # Errors of the belief that were fitted along with the causes and are none of them.
     tolerated: Effects = field(default_factory=dict)
+    guessed: bool = False  # the demand falls between rows of the log, so that nothing there is seen by itself
 
     def with_tolerances(self) -> Loop:
         """The same with those errors in it."""
@@ -82,10 +83,12 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> BorneOu
         return BorneOut(*_without(said, refuted, kept, gap_nm, loop, open_along=open_along), idle)
     if said.word == "unknown":
         return BorneOut(*_closed(said, values, kept, gap_nm, loop), idle)
-    if open_along and _stays(HALF, gap_nm, loop) and _shows(kept, gap_nm, loop) and not _read(said):
+    guesses = loop.guessed and all(f.where == "actuation" for f in said.named)
+    open_still = (open_along or guesses) and _stays(HALF, gap_nm, loop)
+    if open_still and _shows(kept, gap_nm, loop) and not _read(said, loop):
         # However small the gap along the motion is in practice: these causes are not what makes it.
         return BorneOut(_none_of_these(said, kept), _told(kept, refuted, loop, gap_nm), idle)
-    return BorneOut(_doubted(said) if kept and doubtful and not _read(said) else said, None, idle)
+    return BorneOut(_doubted(said) if kept and doubtful and not _read(said, loop) else said, None, idle)
 
 
 def _without(
@@ -94,7 +97,8 @@ def _without(
     """The verdict less the causes that the loop refutes, and what to tell of that."""
     told = _told(kept, refuted, loop, gap_nm)
     known = said.word != "unknown"
-    if known and (open_along or kept) and _stays(HALF, gap_nm, loop) and _shows(kept, gap_nm, loop) and not _read(said):
+    open_still = (open_along or bool(kept)) and _stays(HALF, gap_nm, loop)
+    if known and open_still and _shows(kept, gap_nm, loop) and not _read(said, loop):
         # Causes that describe the gap only with one that the loop refutes are not what makes it.
         return _none_of_these(said, kept), told
     falls = [f for f in said.named if f.effect in refuted]
@@ -129,9 +133,9 @@ def _none_of_these(said: Verdict, kept: Sequence[str]) -> Verdict:
     return Verdict("unknown", said.named, LITTLE if kept else NO_NEARER)
 
 
-def _read(said: Verdict) -> bool:
+def _read(said: Verdict, loop: Loop) -> bool:
     """Whether a cause is seen by itself, in positions or between demand and torque."""
-    return any(f.where == READ_DIRECTLY or of_the_drive(f) for f in said.named)
+    return any(f.where == READ_DIRECTLY or (of_the_drive(f) and not loop.guessed) for f in said.named)
 
 
 def _shows(kept: Sequence[str], gap_nm: float, loop: Loop) -> bool:

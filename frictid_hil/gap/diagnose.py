@@ -86,7 +86,8 @@ def diagnose(
         return best
     for reading in _others(joint, along, best):
         other = _answer(joint, reading, negligible)
-        if other.verdict == "explained" and not _leaves(other, HALF) and _nearer(other, best):
+        closes = best.verdict == "explained" or not _leaves(other, HALF)
+        if other.verdict == "explained" and closes and _nearer(other, best):
             best = other
     return best
 
@@ -191,12 +192,13 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     quiet = quiet_before_any_filter(reading.measured, negligible)
     if quiet and joint.simulation is not None:
         quiet = quiet_in_the_loop(joint.simulation, reading.found, channels, gaps, nothing_nm)
-    said = verdict(reading.found, channels, gaps, nothing_nm, quiet, joint.simulation is not None)
+    said = verdict(reading.found, channels, gaps, nothing_nm, quiet, _loop_floors(joint.simulation, gaps))
     if (warning := below_first_pair(said.named, joint.nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if joint.simulation is not None and said.named and said.word != "none":
         said = _ranked(said, joint.simulation, gaps, guessed=joint.guessed)
-        borne = borne_out(said, _loop(joint.simulation, reading, said, nothing_nm), open_along=_open_along(reading))
+        judge = _loop(joint.simulation, reading, said, nothing_nm, guessed=joint.guessed)
+        borne = borne_out(said, judge, open_along=_open_along(reading))
         said = _ranked(borne.said, joint.simulation, gaps, guessed=joint.guessed, idle=borne.idle)
         if borne.told is not None:
             reasons["closed_loop"] = borne.told
@@ -260,19 +262,25 @@ def _ranked(
     return replace(said, named=tuple(sorted(said.named, key=lambda f: -sizes[f.effect])))
 
 
+def _loop_floors(simulation: Simulation | None, gaps: Sequence[Closed]) -> float | None:
+    """Gap of the closed loop over what noise alone leaves of it; None where there is none."""
+    noise_nm = 0.0 if simulation is None else _noise_nm(simulation, gaps)
+    return None if simulation is None or noise_nm == 0.0 else pooled(simulation.bare, "torque_nm") / noise_nm
+
+
 def _noise_nm(simulation: Simulation, gaps: Sequence[Closed]) -> float:
     """RMS that noise alone leaves of the closed loop's torque, N m."""
     return max([simulation.noise_nm, *(gap.floor for gap in gaps if gap.channel == "actuation")])
 
 
-def _loop(simulation: Simulation, reading: Reading, said: Verdict, nothing_nm: float) -> Loop:
+def _loop(simulation: Simulation, reading: Reading, said: Verdict, nothing_nm: float, *, guessed: bool) -> Loop:
     """The closed loop on the logs a gap is told of, as it judges the causes that are named."""
     every = (t for c in reading.channels for t in c.posterior.channel.nuisances)
     errors = {t.effect for t in every if t.effect and not t.shape} - {f.effect for f in said.named}
     found = {name: numbers(name, reading.channels) for name in sorted(errors)}
     tolerated = {name: {n: v.value for n, v in values.items()} for name, values in found.items() if values}
     before_nm, noise_nm = pooled(simulation.bare, "torque_nm"), _noise_nm(simulation, reading.gaps)
-    return Loop(simulation.gap_nm, before_nm, noise_nm, nothing_nm, tolerated)
+    return Loop(simulation.gap_nm, before_nm, noise_nm, nothing_nm, tolerated, guessed)
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:

@@ -23,6 +23,7 @@ FLOORS_AS_STATED = 3.0
 """A gap below so many floors is none, too, if it means nothing in practice and every belief is as right as it says."""
 STANDS_OUT = 1.0
 """Size of all causes together, over the floor, below which nothing is named: less than what noise itself makes."""
+SHOWS = math.hypot(1.0, STANDS_OUT)  # gap over the floor in which that much is beside the noise
 REMAINS = 0.2  # part of a gap that stays, from which on it may hold another cause: 4 % of its power
 DOUBTED = 0.89
 """Most that is claimed of causes beyond a tolerance that leave a part of the gap, or close one that functions without
@@ -54,7 +55,7 @@ def verdict(
     gaps: Sequence[Closed],  # of each channel
     negligible: float,  # gap that means nothing to the user, in the channels' unit
     otherwise_quiet: bool,  # the residual before any filter and the simulated closed loop show no more than noise
-    loop_judges: bool = False,  # the closed loop can be simulated
+    loop_floors: float | None = None,  # gap of the closed loop over its noise; None where it cannot be simulated
 ) -> Verdict:
     """Decide."""
     unreached = [f for f in found if needed(f, channels) and _unreached(f, channels)]
@@ -63,12 +64,16 @@ def verdict(
     quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
     explained = _root_sum([channel.explained for channel in channels])
     # What has no name in a demand that is a guess is the guess: there the closed loop tells what stays.
-    guessed = [loop_judges and c.posterior.channel.between_rows for c in channels]
+    guessed = [loop_floors is not None and c.posterior.channel.between_rows for c in channels]
     telling = [(c, gap) for c, gap, guess in zip(channels, gaps, guessed, strict=True) if not guess]
     generic = _root_sum([c.generic for c, _ in telling])
     place = _place([c for c, _ in telling])
     if any(f.where == READ_DIRECTLY for f in named):
         return Verdict("explained", named)
+    told = any(f in unreached for f in named)
+    floors_told = [loop_floors or 0.0, *(gap.before / gap.floor for _, gap in telling)]
+    if any(guessed) and otherwise_quiet and not told and max(floors_told) <= SHOWS:
+        return Verdict("none", ())  # whatever causes a guess has
     sure = not _unnamed(channels) and any(_certain(f, channels, gaps) for f in named)
     nothing = not named or (float(np.median(explained)) < STANDS_OUT and not sure)
     generic_wins = float(np.mean(generic > explained)) > 0.5 and float(np.median(generic)) > STANDS_OUT
@@ -76,9 +81,8 @@ def verdict(
     # A gap that is small beside the noise and small in practice is none, whatever tolerance explains it.
     floors = FLOORS_AS_STATED if as_stated(named, channels) else FLOORS
     tiny = quiet and all(gap.before <= min(floors * gap.floor, negligible) for gap in gaps)
-    shows = any(gap.before > math.hypot(1.0, STANDS_OUT) * gap.floor for gap in gaps)
+    shows = any(gap.before > SHOWS * gap.floor for gap in gaps)
     # What identification logs plainly hold is no "none" because the validation logs never came to it.
-    told = any(f in unreached for f in named)
     tiny = tiny and not told and not sure and not (shows and any(needed(f, channels) for f in named))
     doubtful = all(f.chance < EVEN for f in named)  # no reason to call a gap within noise anything but none
     if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):

@@ -259,3 +259,12 @@ def test_a_cause_gains_what_its_refuted_rivals_had() -> None:
     assert {f.effect: f.chance for f in said.named} == {
         "friction_level_error": 0.99, "torque_bias": DOUBTED, "stribeck": 0.3, "gravity_error": 0.4
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(("guessed", "word"), [(False, "explained"), (True, "unknown")])
+def test_what_a_guess_alone_has_must_bring_the_joint_nearer(guessed: bool, word: str) -> None:
+    """Gains that a demand between rows had, and that left all of 4 floors in closed loop, were sure."""
+    named = (cause("controller_gain_error", "actuation"),)
+    judge = replace(loop({"controller_gain_error": 1.02}), guessed=guessed)
+    said, _ = answer(Verdict("explained", named), judge)
+    assert said.word == word
