@@ -56,6 +56,7 @@ class BorneOut:
     said: Verdict  # as far as it bears the verdict out
     told: str | None  # what to tell of that; None where nothing changed
     idle: frozenset[str]  # causes that bring the simulated joint no nearer
+    refuted: frozenset[str] = frozenset()  # of those, the ones that take it further off
 
 
 def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> BorneOut:
@@ -80,7 +81,7 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> BorneOu
     refuted = _refuted(said, values, beside, gap_nm, loop)
     idle = frozenset(values) - set(kept) if kept else frozenset[str]()
     if refuted:
-        return BorneOut(*_without(said, refuted, kept, gap_nm, loop, open_along=open_along), idle)
+        return BorneOut(*_without(said, refuted, kept, gap_nm, loop, open_along=open_along), idle, frozenset(refuted))
     if said.word == "unknown":
         return BorneOut(*_closed(said, values, kept, gap_nm, loop), idle)
     guesses = loop.guessed and all(f.where == "actuation" for f in said.named)

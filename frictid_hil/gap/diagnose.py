@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replayed
-from frictid_hil.gap.borne_out import REFUTED, Loop, borne_out
+from frictid_hil.gap.borne_out import BorneOut, Loop, borne_out
 from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, below_first_pair
 from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.diagnosis import Diagnosis, Value
@@ -199,7 +199,7 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
         said = _ranked(said, joint.simulation, gaps, guessed=joint.guessed)
         judge = _loop(joint.simulation, reading, said, nothing_nm, guessed=joint.guessed)
         borne = borne_out(said, judge, open_along=_open_along(reading))
-        said = _ranked(borne.said, joint.simulation, gaps, guessed=joint.guessed, idle=borne.idle)
+        said = _ranked(borne.said, joint.simulation, gaps, guessed=joint.guessed, borne=borne)
         if borne.told is not None:
             reasons["closed_loop"] = borne.told
             gaps = _closed(channels, said.named)
@@ -229,8 +229,21 @@ def _with_readings(found: list[Finding], channels: Sequence[Sampled], joint: Pre
         )
         told = {form.parameter: Value(value, 0.95 * value, 1.05 * value)}
         others = [f for f in found if f.effect != name]
+        if form.in_loop and joint.simulation is not None:
+            told[form.in_loop] = Value(
+                _loop_share(name, {form.parameter: value}, form.in_loop, others, joint.simulation)
+            )
         found = [*others, Finding(name, READ, READ, max(size, 1.0), 0.0, told, (), READ_DIRECTLY)]
     return sorted(found, key=lambda f: -f.size)
+
+
+def _loop_share(
+    name: str, values: Mapping[str, float], share: str, others: Sequence[Finding], simulation: Simulation
+) -> float:
+    """Whether the controller acts on what is reported, 1 or 0: as the simulated joint comes nearer to its recording."""
+    beside = told_numbers(f for f in others if f.chance >= EVEN)
+    gaps_nm = {acts: simulation.fitted_gap_nm({**beside, name: {**values, share: acts}}) for acts in (0.0, 1.0)}
+    return min(gaps_nm, key=lambda acts: gaps_nm[acts])
 
 
 def _ranked(
@@ -239,12 +252,11 @@ def _ranked(
     gaps: Sequence[Closed],
     *,
     guessed: bool,
-    idle: Collection[str] = (),  # causes that bring the simulated joint no nearer
+    borne: BorneOut | None = None,  # what the closed loop has made of it
 ) -> Verdict:
     """The verdict, causes first that make most where they show most: in a channel, or in the simulated closed loop.
 
-    What a cause changes there counts only if it brings the joint nearer; one that is idle there and unlikely, too, is
-    last.
+    What a cause changes there counts only if it brings the joint nearer; one that the closed loop refutes is last.
 
     Between the rows of its log a controller's demand is a guess: where it is ``guessed``, what shows between demand and
     torque is measured in closed loop alone.
@@ -255,11 +267,10 @@ def _ranked(
     sizes = {f.effect: 0.0 if guessed and f.where == "actuation" else f.size for f in said.named}
     made_nm = simulation.made_nm([told_numbers([f]) for f in said.named])
     for f, made in zip(said.named, made_nm, strict=True):
-        if f.effect not in idle:
+        if borne is None or f.effect not in borne.idle:
             sizes[f.effect] = max(sizes[f.effect], math.sqrt(f.chance) * made / noise_nm)
-        elif f.chance <= REFUTED:
-            sizes[f.effect] = 0.0
-    return replace(said, named=tuple(sorted(said.named, key=lambda f: -sizes[f.effect])))
+    refuted = borne.refuted if borne is not None else ()
+    return replace(said, named=tuple(sorted(said.named, key=lambda f: (f.effect in refuted, -sizes[f.effect]))))
 
 
 def _loop_floors(simulation: Simulation | None, gaps: Sequence[Closed]) -> float | None:

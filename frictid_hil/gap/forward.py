@@ -151,6 +151,11 @@ class Replay:
             held |= self._replayed(self.model(effects), carried, missing)
         return {name: held[name] for name in wanted}
 
+    @property
+    def identifies(self) -> bool:
+        """Whether a log is there for identification."""
+        return any(not e.validation for e in self._experiments)
+
     def without_steps(self) -> Replay:
         """The same replays with an encoder that rounds nothing."""
         other = copy.copy(self)
@@ -237,8 +242,15 @@ class Simulation:
 
     def gap_nm(self, effects: Effects) -> float:
         """RMS of the torque gap with effects added, N m; infinite where no controller holds the joint."""
+        return self._gap_nm(effects, self.validation)
+
+    def fitted_gap_nm(self, effects: Effects) -> float:
+        """The same of the logs that numbers are read from."""
+        return self._gap_nm(effects, False if self.replay.identifies else None)
+
+    def _gap_nm(self, effects: Effects, validation: bool | None) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
-            gap = pooled(self.replay(effects, validation=self.validation), "torque_nm")
+            gap = pooled(self.replay(effects, validation=validation), "torque_nm")
         return gap if math.isfinite(gap) else math.inf
 
 

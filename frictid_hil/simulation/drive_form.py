@@ -93,6 +93,8 @@ class KinematicForm:
     # Its value is the step of the reported position, which makes noise wherever position is differentiated or a stiff
     # spring is driven by it.
     position_step: bool = False
+    # The effect's parameter that tells how far the controller acts on what is reported; the closed loop decides it.
+    in_loop: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ STEP_S = 1e-4  # time step of the model; the slip spring asks for it
 GRAVITY_M_S2 = 9.81
 
 _IN_MJCF = {"inertia", "gravity", "coupling", "coupling_damping", "play"}  # stages that are joint parameters
-_SENSED = {"encoder", "resolution", "report_velocity", "temperature"}  # stages of the report
+_SENSED = {"encoder", "resolution", "report_velocity", "control_velocity", "temperature"}  # stages of the report
 _CONTROLLER = {"proportional_gain", "integral_gain", "derivative_gain"}  # stages of the loop, no part of the joint
 
 

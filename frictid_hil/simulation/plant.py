@@ -388,7 +388,9 @@ def report(parameters: Vector, state: Vector, readings: Vector, tick: int, subst
     state[MEASURED] = measured
     control_share = _filter_share(period_s, parameters[CONTROL_FILTER_S])
     report_share = _filter_share(period_s, parameters[REPORT_FILTER_S])
-    state[CONTROL_VELOCITY] += control_share * (difference - state[CONTROL_VELOCITY])
+    controlled_rad_s = difference
+    # effects at control_velocity transform controlled_rad_s
+    state[CONTROL_VELOCITY] += control_share * (controlled_rad_s - state[CONTROL_VELOCITY])
     state[REPORT_VELOCITY] += report_share * (difference - state[REPORT_VELOCITY])
     reported_rad_s = state[REPORT_VELOCITY]
     # effects at report_velocity transform reported_rad_s

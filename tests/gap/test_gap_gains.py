@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from frictid_hil.gap import diagnose as diagnosing
+from frictid_hil.gap.borne_out import BorneOut
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.diagnosis import Diagnosis, Value
 from frictid_hil.gap.experiment_set import GAINS, Controller
@@ -98,8 +99,8 @@ def test_what_brings_the_joint_no_nearer_counts_along_the_motion_alone() -> None
     )
     simulation = cast(Simulation, SimpleNamespace(noise_nm=0.1, made_nm=lambda each: [1.6, 0.9, 0.2]))
     said = Verdict("explained", causes)
-    idle = {"presliding_hysteresis", "stribeck"}
+    borne = BorneOut(said, None, frozenset({"presliding_hysteresis", "stribeck"}), frozenset({"stribeck"}))
     named = diagnosing._ranked(said, simulation, [], guessed=False).named
     assert [f.effect for f in named] == ["presliding_hysteresis", "stribeck", "torque_saturation"]
-    named = diagnosing._ranked(said, simulation, [], guessed=False, idle=idle).named
+    named = diagnosing._ranked(said, simulation, [], guessed=False, borne=borne).named
     assert [f.effect for f in named] == ["torque_saturation", "presliding_hysteresis", "stribeck"]

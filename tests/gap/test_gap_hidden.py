@@ -101,6 +101,24 @@ def test_a_lag_of_the_drive_is_told_behind_a_velocity_that_lags_by_another_filte
 
 
 @pytest.mark.slow
+def test_a_controller_that_acts_on_a_late_velocity_closes_the_loop(tmp_path: Path) -> None:
+    """The lag was named, and left all of a closed loop's gap of five floors: it changed the report alone."""
+    found = diagnose(_drawn(("velocity_lag",), 3, 114207, tmp_path))
+    (lag,) = found.causes
+    assert lag.effect == "velocity_lag" and lag.parameters["loop_share"].value == 1.0
+    before, after, floor = (f.forward_torque_nm for f in (found.before, found.after, found.noise_floor))
+    assert before is not None and after is not None and floor is not None
+    assert before > 5.0 * floor and after < 1.5 * floor
+
+
+@pytest.mark.slow
+def test_a_lag_of_the_report_alone_leaves_the_controllers_velocity_as_it_is() -> None:
+    found = diagnose(gap_sets.make({"velocity_lag": {"time_constant_s": 0.01}}))
+    lag = next(c for c in found.causes if c.effect == "velocity_lag")
+    assert lag.parameters["loop_share"].value == 0.0
+
+
+@pytest.mark.slow
 def test_play_is_found_behind_a_coarse_encoder(tmp_path: Path) -> None:
     found = diagnose(_drawn(("backlash", "encoder_quantisation"), 42, 102306, tmp_path))
     assert {c.effect for c in found.causes[:2]} == {"backlash", "encoder_quantisation"}

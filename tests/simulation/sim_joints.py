@@ -41,7 +41,7 @@ def excitation(rate_hz: float = 500.0) -> tuple[np.ndarray, np.ndarray]:
     return time, 0.2 + sine + creep + chirp
 
 
-def simulate(model: JointModel, **options: Any) -> Simulated:
+def simulate(model: JointModel, controller: Controller = CONTROLLER, **options: Any) -> Simulated:
     """The excitation on this joint."""
     time, command = excitation()
-    return closed_loop(model, CONTROLLER, time, command, **options)
+    return closed_loop(model, controller, time, command, **options)

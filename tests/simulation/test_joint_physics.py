@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -340,6 +341,19 @@ def test_velocity_lag_is_seen_in_the_report_only() -> None:
     for k in range(1, expected.size):
         expected[k] = expected[k - 1] + share * (plain.velocity_rad_s[k] - expected[k - 1])
     np.testing.assert_allclose(lagged.velocity_rad_s, expected, atol=1e-9)
+
+
+def test_a_controller_may_act_on_the_late_velocity() -> None:
+    """The same loop whose velocity is late by its own filter, or by the effect in front of none."""
+    own = replace(CONTROLLER, velocity_filter_s=0.0)
+    late = simulate(bare(effects={"velocity_lag": {"time_constant_s": 0.008, "loop_share": 1.0}}), controller=own)
+    filtered = simulate(bare(), controller=replace(own, velocity_filter_s=0.008))
+    plain = simulate(bare(), controller=own)
+    np.testing.assert_allclose(late.torque_nm, filtered.torque_nm, atol=1e-9)
+    assert np.max(np.abs(filtered.torque_nm - plain.torque_nm)) > 0.1
+    half = simulate(bare(effects={"velocity_lag": {"time_constant_s": 0.008, "loop_share": 0.5}}), controller=own)
+    between = np.max(np.abs(half.torque_nm - plain.torque_nm)) / np.max(np.abs(filtered.torque_nm - plain.torque_nm))
+    assert 0.3 < between < 0.8
 
 
 def test_positions_come_in_the_coarser_steps() -> None:

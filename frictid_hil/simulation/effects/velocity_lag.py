@@ -22,9 +22,19 @@ def report_velocity(reported_rad_s: float, state: Any, at: int, period_s: float,
     return float(state[at])
 
 
+def control_velocity(
+    controlled_rad_s: float, state: Any, at: int, period_s: float, time_constant_s: float, loop_share: float
+) -> float:
+    """The velocity that the controller acts on, lagging as far as it is taken from the report."""
+    if time_constant_s <= 0.0 or loop_share <= 0.0:
+        return controlled_rad_s
+    state[at + 1] += (1.0 - math.exp(-period_s / time_constant_s)) * (controlled_rad_s - state[at + 1])
+    return float((1.0 - loop_share) * controlled_rad_s + loop_share * state[at + 1])
+
+
 def settle(state: Any, at: int, velocity_rad_s: float) -> None:
     """Caught up."""
-    state[at] = velocity_rad_s
+    state[at] = state[at + 1] = velocity_rad_s
 
 
 LEAST_SHARE = 0.5  # part of the channel's squares that a lag must explain
@@ -70,19 +80,27 @@ EFFECT = Effect(
     documentation=(
         "Drives differentiate the encoder and smooth the result: the reported velocity is a first-order lag of "
         "the true one. A friction curve identified with it is skewed by inertia, because torque and velocity no "
-        "longer belong to the same instant. It shows between reported velocity and differenced position, nowhere "
-        "else. Source: P. R. Belanger et al., 'Estimation of angular velocity and acceleration from shaft-encoder "
-        "measurements', Int. J. Robotics Research 17(11), 1998."
+        "longer belong to the same instant. It shows between reported velocity and differenced position. A controller "
+        "that acts on the same estimate damps late, and its torque differs. Source: P. R. Belanger et al., "
+        "'Estimation of angular velocity and acceleration from shaft-encoder measurements', Int. J. Robotics "
+        "Research 17(11), 1998."
     ),
-    parameters=(Parameter("time_constant_s", 0.0, 0.1, 0.004, "of the first-order lag", off=0.0),),
+    parameters=(
+        Parameter("time_constant_s", 0.0, 0.1, 0.004, "of the first-order lag", off=0.0),
+        Parameter("loop_share", 0.0, 1.0, 0.0, "part of the controller's own velocity that lags so", replayed=False),
+    ),
     signature=Signature((Channel.KINEMATIC,), (Region.KINEMATICS,)),
-    hooks=(Hook("report_velocity", report_velocity), Hook("settle", settle)),
+    hooks=(
+        Hook("report_velocity", report_velocity),
+        Hook("control_velocity", control_velocity),
+        Hook("settle", settle),
+    ),
     illustrate=lambda p: Illustration.lagging_step(p["time_constant_s"], "velocity (rad/s)", "true", "reported"),
     belief="velocity_filter_s",
     # The controller's own velocity may lag as much as the report shows.
     actuation=ActuationForm(
         "time_constant_s", lambda views, seen: np.empty(0) if seen is None else np.array([seen]), None
     ),
-    kinematic=KinematicForm("time_constant_s", read),
-    state_size=1,
+    kinematic=KinematicForm("time_constant_s", read, in_loop="loop_share"),
+    state_size=2,
 )
