@@ -63,7 +63,8 @@ LATE: tuple[tuple[ModuleType, str], ...] = (
     (verdict, "FLOORS"), (verdict, "AS_STATED"), (verdict, "MOST_EXPECTED"), (verdict, "FLOORS_AS_STATED"),
     (verdict, "STANDS_OUT"), (verdict, "REMAINS"), (verdict, "DOUBTED"), (verdict, "HALF"),
     (verdict, "LISTED"), (verdict, "NEEDED"), (verdict, "CERTAIN"), (verdict, "EVEN"), (verdict, "LEADS"),
-    (borne_out, "BOUNCED"), (borne_out, "REFUTED"), (how_far, "COLOUR"), (how_far, "APPEARED"), (how_far, "WINDOW_S"),
+    (borne_out, "BOUNCED"), (borne_out, "REFUTED"), (borne_out, "FAR"),
+    (how_far, "COLOUR"), (how_far, "APPEARED"), (how_far, "WINDOW_S"),
     (quiet, "NEGLIGIBLE"), (quiet, "LOUD"), (diagnosis, "UNDECIDED"),
 )  # fmt: skip
 """What is said of a posterior."""

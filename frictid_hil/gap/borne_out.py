@@ -20,6 +20,9 @@ FACTORS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 BOUNCED = 0.33
 """Part of the closed loop's gap that may stay where a link swings by itself, 11 % of its power: no two contacts bounce
 alike. Other causes may leave ``REMAINS``."""
+FAR = 5.0
+"""Gap that causes leave in closed loop, over its noise, from which on they are not what makes it, if it is half of what
+was there: an encoder's steps and a joint that sticks leave up to four."""
 REFUTED = 0.4  # most that is claimed of a cause that the closed loop does not bear out
 LITTLE = "closed loop: most of its gap stays"
 NO_NEARER = "closed loop: what describes the torque along the motion brings the simulated joint no nearer"
@@ -85,7 +88,8 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> BorneOu
     if said.word == "unknown":
         return BorneOut(*_closed(said, values, kept, gap_nm, loop), idle)
     guesses = loop.guessed and all(f.where == "actuation" for f in said.named)
-    open_still = (open_along or guesses) and _stays(HALF, gap_nm, loop)
+    far = gap_nm > FAR * loop.floor_nm
+    open_still = (open_along or guesses or far) and _stays(HALF, gap_nm, loop)
     if open_still and _shows(kept, gap_nm, loop) and not _read(said, loop):
         # However small the gap along the motion is in practice: these causes are not what makes it.
         return BorneOut(_none_of_these(said, kept), _told(kept, refuted, loop, gap_nm), idle)

@@ -22,13 +22,13 @@ def cause(effect: str, where: str = "plant", chance: float = 0.99, **values: flo
     return Finding(effect, chance, chance, 5.0, 1.0, told, (), where)
 
 
-def loop(gaps_nm: Mapping[str, float], before_nm: float = 1.0) -> Loop:
+def loop(gaps_nm: Mapping[str, float], before_nm: float = 1.0, floor_nm: float = 0.02) -> Loop:
     """A loop whose gaps are told by a table; causes joined by "+" in the order of the alphabet, others far off."""
 
     def gap_nm(effects: Effects) -> float:
         return gaps_nm.get("+".join(sorted(effects)), 9.0)
 
-    return Loop(gap_nm, before_nm, 0.02)
+    return Loop(gap_nm, before_nm, floor_nm)
 
 
 def answer(said: Verdict, judge: Loop, *, open_along: bool = False) -> tuple[Verdict, str | None]:
@@ -137,19 +137,19 @@ def test_what_is_read_directly_needs_no_loop(where: str) -> None:
 
 def test_causes_that_the_loop_hardly_feels_stay_as_they_are() -> None:
     verdict = Verdict("explained", (cause("friction_level_error"),))
-    assert answer(verdict, loop({"friction_level_error": 0.99})) == (verdict, None)
+    assert answer(verdict, loop({"friction_level_error": 0.99}, floor_nm=0.25)) == (verdict, None)
 
 
 def test_causes_that_close_the_gap_neither_along_the_motion_nor_in_the_loop_explain_nothing() -> None:
     verdict = Verdict("explained", (cause("joint_elasticity"),))
     said, told = answer(verdict, loop({"joint_elasticity": 1.05}), open_along=True)
     assert said.word == "unknown" and said.named == verdict.named and "no cause helps" in (told or "")
-    assert answer(verdict, loop({"joint_elasticity": 1.05}), open_along=False)[0].word == "explained"
+    assert answer(verdict, loop({"joint_elasticity": 1.05}, floor_nm=0.25), open_along=False)[0].word == "explained"
     assert answer(verdict, loop({"joint_elasticity": 0.45}), open_along=True)[0].word == "explained"
     little = loop({"joint_elasticity": 0.85})
     assert answer(verdict, little, open_along=True)[0].place == LITTLE
     assert answer(verdict, replace(little, negligible_nm=0.9), open_along=True)[0].word == "explained"
-    assert answer(verdict, little, open_along=False)[0].word == "explained"
+    assert answer(verdict, replace(little, floor_nm=0.25), open_along=False)[0].word == "explained"
     in_the_noise = loop({"joint_elasticity": 0.031}, before_nm=0.03)
     assert answer(verdict, in_the_noise, open_along=True)[0].word == "explained"
 
@@ -172,10 +172,10 @@ def test_play_leads_where_the_motion_told_half_of_it() -> None:
 def test_a_cause_that_leaves_half_of_the_loop_open_is_doubted() -> None:
     named = (cause("torque_bias"), cause("inertia_error", chance=0.6))
     gaps = {"torque_bias": 0.6, "inertia_error": 1.0, "inertia_error+torque_bias": 0.6}
-    said, told = answer(Verdict("explained", named), loop(gaps))
+    said, told = answer(Verdict("explained", named), loop(gaps, floor_nm=0.2))
     assert told is None and [f.chance for f in said.named] == [DOUBTED, 0.6]
     gaps = {"torque_bias": 0.3, "inertia_error": 1.0, "inertia_error+torque_bias": 0.3}
-    assert answer(Verdict("explained", named), loop(gaps))[0].named == named
+    assert answer(Verdict("explained", named), loop(gaps, floor_nm=0.2))[0].named == named
 
 
 def test_elasticity_that_the_motion_tells_badly_is_rescued_by_the_loop() -> None:
@@ -265,6 +265,14 @@ def test_a_cause_gains_what_its_refuted_rivals_had() -> None:
 def test_what_a_guess_alone_has_must_bring_the_joint_nearer(guessed: bool, word: str) -> None:
     """Gains that a demand between rows had, and that left all of 4 floors in closed loop, were sure."""
     named = (cause("controller_gain_error", "actuation"),)
-    judge = replace(loop({"controller_gain_error": 1.02}), guessed=guessed)
+    judge = replace(loop({"controller_gain_error": 1.02}, floor_nm=0.25), guessed=guessed)
     said, _ = answer(Verdict("explained", named), judge)
     assert said.word == word
+
+
+@pytest.mark.parametrize(("floor_nm", "word"), [(0.02, "unknown"), (0.3, "explained")])
+def test_what_closes_along_the_motion_alone_explains_no_gap_of_many_floors(floor_nm: float, word: str) -> None:
+    """A cable of 28 floors was a bias and a gravity, which left 32 floors of the closed loop's 37."""
+    named = (cause("torque_bias"), cause("gravity_error"))
+    gaps = {"torque_bias": 0.95, "gravity_error": 0.93, "gravity_error+torque_bias": 0.85}
+    assert answer(Verdict("explained", named), loop(gaps, floor_nm=floor_nm))[0].word == word
