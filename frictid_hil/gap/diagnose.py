@@ -34,6 +34,7 @@ from frictid_hil.gap.verdict import (
     HALF,
     READ_DIRECTLY,
     REMAINS,
+    SHOWS,
     TIED,
     Verdict,
     stays,
@@ -192,7 +193,8 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     quiet = quiet_before_any_filter(reading.measured, negligible)
     if quiet and joint.simulation is not None:
         quiet = quiet_in_the_loop(joint.simulation, reading.found, channels, gaps, nothing_nm)
-    said = verdict(reading.found, channels, gaps, nothing_nm, quiet, _loop_floors(joint.simulation, gaps))
+    still = joint.guessed and _still(joint.simulation, gaps)
+    said = verdict(reading.found, channels, gaps, nothing_nm, quiet, joint.simulation is not None, still)
     if (warning := below_first_pair(said.named, joint.nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if joint.simulation is not None and said.named and said.word != "none":
@@ -273,10 +275,9 @@ def _ranked(
     return replace(said, named=tuple(sorted(said.named, key=lambda f: (f.effect in refuted, -sizes[f.effect]))))
 
 
-def _loop_floors(simulation: Simulation | None, gaps: Sequence[Closed]) -> float | None:
-    """Gap of the closed loop over what noise alone leaves of it; None where there is none."""
-    noise_nm = 0.0 if simulation is None else _noise_nm(simulation, gaps)
-    return None if simulation is None or noise_nm == 0.0 else pooled(simulation.bare, "torque_nm") / noise_nm
+def _still(simulation: Simulation | None, gaps: Sequence[Closed]) -> bool:
+    """Whether the closed loop shows no gap as large as its noise."""
+    return simulation is not None and pooled(simulation.bare, "torque_nm") <= SHOWS * _noise_nm(simulation, gaps)
 
 
 def _noise_nm(simulation: Simulation, gaps: Sequence[Closed]) -> float:

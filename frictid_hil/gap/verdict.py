@@ -55,7 +55,8 @@ def verdict(
     gaps: Sequence[Closed],  # of each channel
     negligible: float,  # gap that means nothing to the user, in the channels' unit
     otherwise_quiet: bool,  # the residual before any filter and the simulated closed loop show no more than noise
-    loop_floors: float | None = None,  # gap of the closed loop over its noise; None where it cannot be simulated
+    loop_judges: bool = False,  # the closed loop can be simulated
+    loop_still: bool = False,  # it shows no gap as large as its noise, and what the controller asks for is a guess
 ) -> Verdict:
     """Decide."""
     unreached = [f for f in found if needed(f, channels) and _unreached(f, channels)]
@@ -64,15 +65,14 @@ def verdict(
     quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
     explained = _root_sum([channel.explained for channel in channels])
     # What has no name in a demand that is a guess is the guess: there the closed loop tells what stays.
-    guessed = [loop_floors is not None and c.posterior.channel.between_rows for c in channels]
+    guessed = [loop_judges and c.posterior.channel.between_rows for c in channels]
     telling = [(c, gap) for c, gap, guess in zip(channels, gaps, guessed, strict=True) if not guess]
     generic = _root_sum([c.generic for c, _ in telling])
     place = _place([c for c, _ in telling])
     if any(f.where == READ_DIRECTLY for f in named):
         return Verdict("explained", named)
     told = any(f in unreached for f in named)
-    floors_told = [loop_floors or 0.0, *(gap.before / gap.floor for _, gap in telling)]
-    if any(guessed) and otherwise_quiet and not told and max(floors_told) <= SHOWS:
+    if loop_still and otherwise_quiet and not told and all(gap.before <= SHOWS * gap.floor for _, gap in telling):
         return Verdict("none", ())  # whatever causes a guess has
     sure = not _unnamed(channels) and any(_certain(f, channels, gaps) for f in named)
     nothing = not named or (float(np.median(explained)) < STANDS_OUT and not sure)
