@@ -6,7 +6,7 @@ joint; what brings it no nearer, alone or beside the others, is no cause of the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from frictid_hil.gap.diagnosis import Value
@@ -72,7 +72,7 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> BorneOu
     same with the errors of the belief that were fitted along. A cause is refuted that adds ``HALF`` of the visible gap
     or more to what the chosen ones leave, or ``REMAINS`` if another one explains the gap.
     """
-    values = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in said.named}
+    values = _numbers(said.named)
     rivals = {f.effect: f.rivals for f in said.named}
     kept, gap_nm, beside = _chosen(values, rivals, loop)
     doubtful = _stays(HALF, gap_nm, loop)
@@ -102,18 +102,22 @@ def _without(
     """The verdict less the causes that the loop refutes, and what to tell of that."""
     told = _told(kept, refuted, loop, gap_nm)
     known = said.word != "unknown"
+    falls = [f for f in said.named if f.effect in refuted]
+    stands = [_instead_of(f, falls) for f in said.named if f.effect not in refuted]
+    falls = [f.at_most(REFUTED) for f in falls]
+    if _stays(HALF, gap_nm, loop) and any(swings(f.effect) for f in stands):
+        rescued, closes = _rescued(Verdict("unknown", tuple(stands)), _numbers(stands), kept, loop)
+        if closes is not None:
+            return replace(rescued, named=(*rescued.named, *falls)), closes
     open_still = (open_along or bool(kept)) and _stays(HALF, gap_nm, loop)
     if known and open_still and _shows(kept, gap_nm, loop) and not _read(said, loop):
         # Causes that describe the gap only with one that the loop refutes are not what makes it.
         return _none_of_these(said, kept), told
-    falls = [f for f in said.named if f.effect in refuted]
-    stands = [_instead_of(f, falls) for f in said.named if f.effect not in refuted]
-    falls = [f.at_most(REFUTED) for f in falls]
     if known and said.named[0].effect not in refuted:
         return replace(said, named=(*stands, *falls)), told
     stands.sort(key=lambda f: kept.index(f.effect) if f.effect in kept else len(kept))
     stands = [f if f.where == READ_DIRECTLY else f.at_most(DOUBTED) for f in stands]
-    helping = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in stands if f.effect in kept}
+    helping = _numbers(f for f in stands if f.effect in kept)
     stands, gap_nm = _refined(stands, helping, loop, gap_nm)
     told = _told(kept, refuted, loop, gap_nm)
     may_stay = BOUNCED if any(swings(name) for name in kept) else REMAINS
@@ -132,6 +136,10 @@ def _closed(
         named = sorted(said.named, key=lambda f: f.effect not in kept)
         return _doubted(Verdict("explained", tuple(named))), _told(kept, set(), loop, gap_nm)
     return _rescued(said, values, kept, loop) if any(swings(name) for name in values) else (said, None)
+
+
+def _numbers(causes: Iterable[Finding]) -> dict[str, dict[str, float]]:
+    return {f.effect: {name: v.value for name, v in f.parameters.items()} for f in causes}
 
 
 def _none_of_these(said: Verdict, kept: Sequence[str]) -> Verdict:

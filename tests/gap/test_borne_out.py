@@ -276,3 +276,17 @@ def test_what_closes_along_the_motion_alone_explains_no_gap_of_many_floors(floor
     named = (cause("torque_bias"), cause("gravity_error"))
     gaps = {"torque_bias": 0.95, "gravity_error": 0.93, "gravity_error+torque_bias": 0.85}
     assert answer(Verdict("explained", named), loop(gaps, floor_nm=floor_nm))[0].word == word
+
+
+def test_play_whose_numbers_the_motion_tells_badly_stands_beside_causes_that_are_refuted() -> None:
+    """Play of 13 floors was `unknown`: the motion told an eighth of it and made up for it by wrong causes."""
+    play = cause("backlash", gap_rad=1e-3, contact_stiffness_nm_per_rad=2e5, contact_relaxation_s=3e-3)
+
+    def gap_nm(effects: Effects) -> float:
+        slack = abs(effects.get("backlash", {}).get("gap_rad", 0.0) - 4e-3) / 4e-3
+        return 0.04 + 0.6 * slack + (1.0 if "torque_constant_error" in effects else 0.0)
+
+    named = (cause("torque_constant_error", error_share=0.1), play)
+    said, told = answer(Verdict("unknown", named), Loop(gap_nm, 0.64, 0.04))
+    assert (said.word, [f.effect for f in said.named]) == ("explained", ["backlash", "torque_constant_error"])
+    assert said.named[1].chance == REFUTED and told is not None and "with backlash" in told
