@@ -59,7 +59,7 @@ SAMPLED = {  # function: the parameters that the whole check takes; ``--long`` t
     },
     "test_an_averaging_filter_of_150_ms_ends_in_the_gates_refusal": {"batch"},
     "test_twice_stops_quickly": {"2-15"},
-    "test_an_effect_is_recorded_named_and_closed": {"torque_bias"},
+    "test_every_family_is_checked_calibrated_and_compensated": {"STS3215", "XL430-W250"},
     "test_the_commands_of_a_guide_run": {"connect-a-drive", "diagnose", "recalibrate", "replay", "robot-file"},
     "test_a_fault_leaves_nothing_moving_nothing_lost_and_no_wrong_curve": {
         *("calibrate-cycles-bus off", "calibrate-cycles-node reboots", "calibrate-move-position jumps a turn"),
@@ -84,6 +84,9 @@ SAMPLED = {  # function: the parameters that the whole check takes; ``--long`` t
     "test_function_a_reaches_its_level_on_other_friction": {"0-0", "1-3", "3-4", "5-2"},
 }
 LONG = {  # functions that ``--long`` alone runs: what they show is shown by others in a smaller way
+    "test_a_killed_worker_of_a_cluster_costs_its_own_task_alone",
+    "test_an_effect_is_recorded_named_and_closed",
+    "test_equal_seeds_seal_equal_truth_whatever_the_processes",
     "test_behind_another_authors_canopen_on_that_link",
     "test_can_fd_carries_them_faster_and_its_log_replays",
     "test_can_fd_changes_no_figure",
