@@ -6,11 +6,11 @@ joint; what brings it no nearer, alone or beside the others, is no cause of the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from frictid_hil.gap.diagnosis import Value
-from frictid_hil.gap.findings import Finding
+from frictid_hil.gap.findings import Finding, told_numbers
 from frictid_hil.gap.forward import Effects
 from frictid_hil.gap.verdict import DOUBTED, FLOORS, HALF, READ_DIRECTLY, REMAINS, Verdict, swings
 from frictid_hil.simulation.effects import all_effects
@@ -72,7 +72,7 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> BorneOu
     same with the errors of the belief that were fitted along. A cause is refuted that adds ``HALF`` of the visible gap
     or more to what the chosen ones leave, or ``REMAINS`` if another one explains the gap.
     """
-    values = _numbers(said.named)
+    values = told_numbers(said.named)
     rivals = {f.effect: f.rivals for f in said.named}
     kept, gap_nm, beside = _chosen(values, rivals, loop)
     doubtful = _stays(HALF, gap_nm, loop)
@@ -106,7 +106,7 @@ def _without(
     stands = [_instead_of(f, falls) for f in said.named if f.effect not in refuted]
     falls = [f.at_most(REFUTED) for f in falls]
     if _stays(HALF, gap_nm, loop) and any(swings(f.effect) for f in stands):
-        rescued, closes = _rescued(Verdict("unknown", tuple(stands)), _numbers(stands), kept, loop)
+        rescued, closes = _rescued(Verdict("unknown", tuple(stands)), told_numbers(stands), kept, loop, refuted)
         if closes is not None:
             return replace(rescued, named=(*rescued.named, *falls)), closes
     open_still = (open_along or bool(kept)) and _stays(HALF, gap_nm, loop)
@@ -117,7 +117,7 @@ def _without(
         return replace(said, named=(*stands, *falls)), told
     stands.sort(key=lambda f: kept.index(f.effect) if f.effect in kept else len(kept))
     stands = [f if f.where == READ_DIRECTLY else f.at_most(DOUBTED) for f in stands]
-    helping = _numbers(f for f in stands if f.effect in kept)
+    helping = told_numbers(f for f in stands if f.effect in kept)
     stands, gap_nm = _refined(stands, helping, loop, gap_nm)
     told = _told(kept, refuted, loop, gap_nm)
     may_stay = BOUNCED if any(swings(name) for name in kept) else REMAINS
@@ -136,10 +136,6 @@ def _closed(
         named = sorted(said.named, key=lambda f: f.effect not in kept)
         return _doubted(Verdict("explained", tuple(named))), _told(kept, set(), loop, gap_nm)
     return _rescued(said, values, kept, loop) if any(swings(name) for name in values) else (said, None)
-
-
-def _numbers(causes: Iterable[Finding]) -> dict[str, dict[str, float]]:
-    return {f.effect: {name: v.value for name, v in f.parameters.items()} for f in causes}
 
 
 def _none_of_these(said: Verdict, kept: Sequence[str]) -> Verdict:
@@ -181,7 +177,9 @@ def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm
     return refuted | {n for n, nm in without.items() if all_nm**2 - nm**2 > REMAINS**2 * loop.visible}
 
 
-def _rescued(said: Verdict, values: Effects, kept: Sequence[str], loop: Loop) -> tuple[Verdict, str | None]:
+def _rescued(
+    said: Verdict, values: Effects, kept: Sequence[str], loop: Loop, refuted: Collection[str] = ()
+) -> tuple[Verdict, str | None]:
     """Causes that let the link swing may close the loop, although their columns lose the link's phase."""
     helping = {name: values[name] for name in values if name in kept or swings(name)}
     before = [f for f in said.named if f.effect in helping]
@@ -189,7 +187,7 @@ def _rescued(said: Verdict, values: Effects, kept: Sequence[str], loop: Loop) ->
     if stands == before or _stays(BOUNCED, closer_nm, loop):
         return said, None
     rest = [f for f in said.named if f.effect not in helping]
-    return _doubted(Verdict("explained", (*stands, *rest))), _told(list(helping), set(), loop, closer_nm)
+    return _doubted(Verdict("explained", (*stands, *rest))), _told(list(helping), refuted, loop, closer_nm)
 
 
 def _doubted(said: Verdict) -> Verdict:
@@ -289,7 +287,7 @@ def _spread(told: Value, value: float) -> Value:
     return Value(value, value - half, value + half)
 
 
-def _told(kept: Sequence[str], refuted: set[str], loop: Loop, gap_nm: float) -> str:
+def _told(kept: Sequence[str], refuted: Collection[str], loop: Loop, gap_nm: float) -> str:
     helps = f"{gap_nm:.3g} with {' and '.join(kept)}" if kept else "and no cause helps"
     harm = f"; {', '.join(sorted(refuted))} would take it further off" if refuted else ""
     return f"the simulated torque of the validation logs is {loop.before_nm:.3g} N m off, {helps}{harm}"

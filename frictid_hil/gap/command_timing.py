@@ -71,11 +71,12 @@ def _lateness(controller: Controller, logs: Sequence[tuple[Experiment, Experimen
     late = numbers[0]
     shares = np.zeros(len(GAINS))
     for _ in range(ROUNDS):
+        if np.any(shares):
+            table = _tables(with_gains(controller, shares.tolist()), controller, logs)
         numbers, left = _fitted(table)
         if left <= HALVED**2 * stated and _apart(table) > ALIKE:
             late = numbers[len(GAINS)]
         shares = np.clip((1.0 + shares) * (1.0 + numbers[: len(GAINS)]) - 1.0, *PLAUSIBLE)
-        table = _tables(with_gains(controller, shares.tolist()), controller, logs)
     return float(np.clip(late, 0.0, 1.0))
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
-from frictid_hil.gap.findings import EVEN, Sampled, either_way, whole_draws
+from frictid_hil.gap.findings import EVEN, Sampled, either_way, told_numbers, whole_draws
 from frictid_hil.gap.forward import Replayed, why_not
 from frictid_hil.gap.how_far import Closed, held_out, simulated
 from frictid_hil.gap.next_experiment import next_experiment
@@ -25,7 +25,7 @@ def told(
     if simulation is None:
         reasons["forward_torque_nm"] = why_not(experiments) or ""
         reasons.setdefault("forward_position_rad", reasons["forward_torque_nm"])
-    effects = {f.effect: {n: v.value for n, v in f.parameters.items()} for f in said.named if f.confidence >= EVEN}
+    effects = told_numbers(f for f in said.named if f.confidence >= EVEN)
     bare, replay = (None, None) if simulation is None else (simulation.bare, simulation.replay)
     applied = said.word == "explained"
     runs: dict[str, Mapping[str, Replayed]] = {}

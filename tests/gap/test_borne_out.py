@@ -18,7 +18,7 @@ BACKLASH = {"gap_rad": 0.004, "contact_stiffness_nm_per_rad": 20000.0, "contact_
 
 
 def cause(effect: str, where: str = "plant", chance: float = 0.99, **values: float) -> Finding:
-    told = {name: Value(value, 0.9 * value, 1.1 * value) for name, value in values.items()}
+    told = {name: Value(value, 0.9 * value, 1.1 * value) for name, value in (values or {"any": 1.0}).items()}
     return Finding(effect, chance, chance, 5.0, 1.0, told, (), where)
 
 
@@ -247,6 +247,14 @@ def test_what_has_no_name_along_the_motion_is_no_gap_where_the_causes_close_the_
             ("gravity_error", 0.6),
         ]
         assert borne.idle == {"gravity_error"}
+
+
+def test_a_cause_without_numbers_is_not_simulated() -> None:
+    """It took its typical size, and was borne out or refuted by that."""
+    unknown = replace(cause("stribeck"), parameters={})
+    gaps = {"torque_bias": 0.1, "stribeck": 3.0, "stribeck+torque_bias": 3.0}
+    said, told = answer(Verdict("explained", (cause("torque_bias"), unknown)), loop(gaps))
+    assert said.named == (cause("torque_bias"), unknown) and told is None
 
 
 def test_a_cause_gains_what_its_refuted_rivals_had() -> None:
