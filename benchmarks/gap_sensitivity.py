@@ -46,6 +46,7 @@ from frictid_hil.gap import (
     prepared,
     presliding,
     quiet,
+    reading,
     residuals,
     verdict,
 )
@@ -79,14 +80,13 @@ TABLES: tuple[tuple[ModuleType, str], ...] = (
     (plant_channel, "BEYOND"), (plant_channel, "SIZES"), (plant_channel, "SWAMPED"), (plant_channel, "UNTOLD"),
     (plant_channel, "LINE_SHARE"), (generic, "WAYS_RAD"), (generic, "REST_S"), (generic, "STILL_S"),
     (generic, "REACHES"), (nuisances, "FREE"), (nuisances, "STIFFER"), (actuation_channel, "WITHIN_ROWS"),
-    (actuation_channel, "LIMITED"), (diagnosis, "COARSE"), (linear_loop, "CREEP"), (loop_channel, "STANDS_S"),
+    (reading, "COARSE"), (linear_loop, "CREEP"), (loop_channel, "STANDS_S"),
     (loop_channel, "COUNTS"), (presliding, "CLEARLY"), (residuals, "LEAST_SHARE"),
     (command_timing, "HALVED"), (command_timing, "ALIKE"),
 )  # fmt: skip
 """The tables of the channels."""
 CHANCES = (
-    "SIDED", "DOUBTED", "NEEDED", "CERTAIN", "LEADS", "EVEN", "UNTOLD", "REFUTED", "UNDECIDED", "LISTED", "LIMITED",
-    "CLEARLY",
+    "SIDED", "DOUBTED", "NEEDED", "CERTAIN", "LEADS", "EVEN", "UNTOLD", "REFUTED", "UNDECIDED", "LISTED", "CLEARLY",
 )  # fmt: skip
 
 Answer = tuple[str, str]
@@ -169,10 +169,10 @@ def all_answers(case: Path, tables: bool, only: frozenset[str]) -> dict[str, Ans
         if tables:
             vary(TABLES)
         for name in ("plant_channel", "actuation_channel", "tracking_channel"):
-            held.enter_context(put(diagnosis, name, once(getattr(diagnosis, name), library)))
-        held.enter_context(put(diagnosis, "Posterior", same_tables()))
+            held.enter_context(put(reading, name, once(getattr(reading, name), library)))
+        held.enter_context(put(reading, "Posterior", same_tables()))
         vary(SEARCHED)
-        held.enter_context(put(diagnosis, "sampled", once(findings.sampled, lambda one: columns(one.channel))))
+        held.enter_context(put(reading, "sampled", once(findings.sampled, lambda one: columns(one.channel))))
         vary(LATE)
     return answers
 

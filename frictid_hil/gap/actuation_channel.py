@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from frictid_hil.config.nominal import ReportFilter
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Builder, Channel, Term, of_each_log, rows_of
-from frictid_hil.gap.command_timing import FASTEST, PLAUSIBLE, ROUNDS, between_rows
-from frictid_hil.gap.experiment_set import GAINS, Controller, Nominal, with_gains
+from frictid_hil.gap.command_timing import FASTEST, between_rows
+from frictid_hil.gap.drives import Drive, forms
+from frictid_hil.gap.experiment_set import Controller, Nominal, with_gains
+from frictid_hil.gap.gain_errors import gain_errors
 from frictid_hil.gap.plant_channel import BEYOND, families_of, white_nm, without_nuisances
 from frictid_hil.gap.residuals import (
     LowPass,
@@ -23,7 +24,6 @@ from frictid_hil.gap.residuals import (
     reported,
     rms,
     settled,
-    ticks_of,
 )
 from frictid_hil.simulation.drive_form import ActuationForm, DriveView
 from frictid_hil.simulation.effects import all_effects
@@ -33,28 +33,8 @@ SLOWEST = 10
 """Control ticks to a row of the log up to which what the controller did between two rows can be told from them."""
 WITHIN_ROWS = 0.3
 """One-sigma of when a command took effect and a velocity was taken, in rows of a log slower than its controller."""
-LIMITED = 0.99  # share of the torque limit from which a demand is limited
 NEAREST = (1.0 / math.sqrt(2.0), math.sqrt(2.0))
 """Coefficients of a time: values to try at most double, so that the nearest one is no further from the true one."""
-
-
-def forms() -> dict[str, ActuationForm]:
-    """Every effect's form in this channel, in the order in which they act."""
-    found = {name: effect.actuation for name, effect in all_effects().items() if effect.actuation is not None}
-    return dict(sorted(found.items(), key=lambda item: item[1].order))
-
-
-def through(demand_nm: Array, effects: Mapping[str, Mapping[str, float]], step_s: float, limit_nm: float) -> Array:
-    """Torque reported for a demand in force from each sample on: the mean over the step before, shape (n,)."""
-    torque = held(demand_nm)
-    for name, form in forms().items():
-        if name not in effects or form.torque is None:
-            continue
-        values = effects[name]
-        if values[form.parameter] != all_effects()[name].off[form.parameter]:
-            detail = (values.get(form.detail, form.details[0]),) if form.detail else ()
-            torque = form.torque(torque, values[form.parameter], step_s, limit_nm, *detail)
-    return torque
 
 
 def why_not_replayed(nominal: Nominal, recordings: Sequence[Recording]) -> str | None:
@@ -85,17 +65,21 @@ def actuation_channel(
     logs = [r for r in recordings if r.experiment.torque_nm is not None and r.demand_nm is not None]
     controller = nominal.controller
     limit_nm = math.inf if controller is None else controller.torque_limit_nm
-    drives = [_Drive.of(r, nominal, limit_nm) for r in logs]
+    drives = [Drive.of(r, nominal) for r in logs]
     base = [drive.torque(nominal.believed_effects) for drive in drives]
-    residuals = _residuals(nominal, logs, base, limit_nm, believed)
-    shares = _shares(controller, logs, base, residuals).tolist()
+    shown = _beside([Drive.of(r, nominal) for r in believed], nominal) or [np.zeros(b.size) for b in base]
+    residuals = [left - own for left, own in zip(_beside(drives, nominal), shown, strict=True)]
+    # A drive acts on what the controller asks for, and that on the velocity it sees: the one that was read to lag.
+    lags = any(form.torque is None and name in seen for name, form in forms().items())
+    shares = gain_errors(nominal, logs, shown, library, as_reported=lags).tolist()
     views = [_view(r, controller, limit_nm, shares) for r in logs]
     builder = Builder([[] for _ in logs])
     nuisances, candidates = _gains(nominal, views, builder, library)
     nuisances += _timing(nominal, base, logs, builder)
-    # A drive acts on what the controller asks for, and that on the velocity it sees: the one that was read to lag.
-    lags = any(form.torque is None and name in seen for name, form in forms().items())
-    asking = [_Drive.of(d.recording, nominal, limit_nm, as_reported=True) for d in drives] if lags else drives
+    # It is late with what wrong gains ask for, too.
+    found = nominal if controller is None else replace(nominal, controller=with_gains(controller, shares))
+    drives = [Drive.of(r, found) for r in logs]
+    asking = [Drive.of(r, found, as_reported=True) for r in logs] if lags else drives
     scale = rms(np.concatenate(residuals))
     for name, form in forms().items():
         if name not in library:
@@ -131,32 +115,6 @@ def _view(recording: Recording, controller: Controller | None, limit_nm: float, 
     if controller is not None and e.torque_demand_nm is None:
         parts = demand_parts(controller, e, recording.step_s, shares)
     return DriveView(recording.step_s, limit_nm, recording.demand_nm, e.torque_nm, parts)
-
-
-def _shares(
-    controller: Controller | None, logs: Sequence[Recording], base: Sequence[Array], residuals: Sequence[Array]
-) -> Array:
-    """Errors of the three gains by least squares, where the demand is not linear in them; else 0."""
-    shares: Array = np.zeros(len(GAINS))
-    if controller is None or any(r.experiment.torque_demand_nm is not None for r in logs):
-        return shares
-    limited = any(float(np.max(np.abs(b))) >= LIMITED * controller.torque_limit_nm for b in base)
-    if not (limited or controller.cascade):
-        return shares
-    pairs = list(zip(logs, residuals, strict=True))
-    fitted = [(r, y) for r, y in pairs if not r.experiment.validation] or pairs
-    for _ in range(ROUNDS):
-        there = with_gains(controller, shares.tolist())
-        tables, rests = [], []
-        for r, residual in fitted:
-            made = demand_parts(controller, r.experiment, r.step_s, shares.tolist()) @ shares
-            table = demand_parts(there, r.experiment, r.step_s, [0.0] * len(GAINS)) / (1.0 + shares)
-            rest = residual[1:] - made[:-1]
-            tables.append((table - np.mean(table, axis=0))[:-1])
-            rests.append(rest - np.mean(rest))
-        shares = shares + np.linalg.lstsq(np.concatenate(tables), np.concatenate(rests), rcond=None)[0]
-        shares = np.clip(shares, *PLAUSIBLE)
-    return shares
 
 
 def _gains(
@@ -215,8 +173,8 @@ def _shapes(
     name: str,
     form: ActuationForm,
     views: Sequence[DriveView],
-    drives: Sequence[_Drive],
-    asking: Sequence[_Drive],
+    drives: Sequence[Drive],
+    asking: Sequence[Drive],
     nominal: Nominal,
     seen: Mapping[str, float],
 ) -> list[tuple[dict[str, float], list[Array]]]:
@@ -258,46 +216,12 @@ def _generic(logs: Sequence[Recording], base: Sequence[Array]) -> dict[str, list
     return table
 
 
-@dataclass(frozen=True, slots=True)
-class _Drive:
-    """What a drive is asked for in one recording, at every tick of its controller."""
-
-    recording: Recording  # its rows
-    demand_nm: Array  # at every tick, shape (n * ticks,)
-    ticks: int  # of the controller to a row
-    limit_nm: float  # of the torque
-
-    @staticmethod
-    def of(recording: Recording, nominal: Nominal, limit_nm: float, *, as_reported: bool = False) -> _Drive:
-        """The drive of one recording; its controller may see the reported velocity instead of the believed one."""
-        controller, e = nominal.controller, recording.experiment
-        assert recording.demand_nm is not None
-        if controller is None or e.torque_demand_nm is not None:
-            return _Drive(recording, recording.demand_nm, 1, limit_nm)
-        seen = e.velocity_rad_s if as_reported else None
-        demand = demand_of(controller, e, recording.step_s, velocity_rad_s=seen, every_tick=True)
-        return _Drive(recording, demand, ticks_of(controller, recording.step_s), limit_nm)
-
-    def torque(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
-        """Torque that the drive makes with these effects, at every row, N m, shape (n,)."""
-        return through(self.demand_nm, effects, self.recording.step_s / self.ticks, self.limit_nm)[:: self.ticks]
-
-
-def _residuals(
-    nominal: Nominal, logs: Sequence[Recording], base: Sequence[Array], limit_nm: float, believed: Sequence[Recording]
-) -> list[Array]:
-    """Reported torque less the demand's, per log; less what the believed joint recorded alike shows of that."""
+def _beside(drives: Sequence[Drive], nominal: Nominal) -> list[Array]:
+    """Reported torque less the believed one, as the drive reports it, N m, shape (n,) per recording."""
     report = nominal.torque_report_filter
-    residuals = [_residual(r, b, report) for r, b in zip(logs, base, strict=True)]
-    if not believed:
-        return residuals
-    drives = [_Drive.of(b, nominal, limit_nm) for b in believed]
-    shown = [_residual(d.recording, d.torque(nominal.believed_effects), report) for d in drives]
-    return [left - own for left, own in zip(residuals, shown, strict=True)]
-
-
-def _residual(recording: Recording, asked_nm: Array, report: ReportFilter | None) -> Array:
-    """Reported torque less the believed one, as the drive reports it, N m, shape (n,)."""
-    torque = recording.experiment.torque_nm
-    assert torque is not None
-    return settled(torque - reported(asked_nm, report, recording.step_s), recording.step_s)
+    left = []
+    for drive in drives:
+        r, torque = drive.recording, drive.recording.experiment.torque_nm
+        assert torque is not None
+        left.append(settled(torque - reported(drive.torque(nominal.believed_effects), report, r.step_s), r.step_s))
+    return left

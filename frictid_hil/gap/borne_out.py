@@ -120,8 +120,7 @@ def _without(
     helping = told_numbers(f for f in stands if f.effect in kept)
     stands, gap_nm = _refined(stands, helping, loop, gap_nm)
     told = _told(kept, refuted, loop, gap_nm)
-    may_stay = BOUNCED if any(swings(name) for name in kept) else REMAINS
-    if (kept and not _stays(may_stay, gap_nm, loop)) or any(f.where == READ_DIRECTLY for f in stands):
+    if (kept and not _stays(_may_stay(kept), gap_nm, loop)) or any(f.where == READ_DIRECTLY for f in stands):
         # What is read from the positions themselves is there, whatever the loop makes of the others.
         return Verdict("explained", (*stands, *falls)), told
     return Verdict("unknown", (*stands, *falls), said.place or NO_NEARER), told
@@ -132,7 +131,7 @@ def _closed(
 ) -> tuple[Verdict, str | None]:
     """What has no name along the motion is no part of the gap where the causes close the loop."""
     shows = loop.before_nm > FLOORS * loop.floor_nm
-    if kept and shows and not _stays(REMAINS, gap_nm, loop) and not said.place.startswith("actuation"):
+    if kept and shows and not _stays(_may_stay(kept), gap_nm, loop) and not said.place.startswith("actuation"):
         named = sorted(said.named, key=lambda f: f.effect not in kept)
         return _doubted(Verdict("explained", tuple(named))), _told(kept, set(), loop, gap_nm)
     return _rescued(said, values, kept, loop) if any(swings(name) for name in values) else (said, None)
@@ -157,6 +156,11 @@ def _instead_of(cause: Finding, falls: Sequence[Finding]) -> Finding:
     gained = sum(f.chance for f in falls if f.effect in cause.rivals or cause.effect in f.rivals)
     chance, confidence = (max(c, min(DOUBTED, c + gained)) for c in (cause.chance, cause.confidence))
     return replace(cause, chance=chance, confidence=confidence)
+
+
+def _may_stay(kept: Collection[str]) -> float:
+    """Part of the closed loop's gap that these causes may leave."""
+    return BOUNCED if any(swings(name) for name in kept) else REMAINS
 
 
 def _stays(part: float, gap_nm: float, loop: Loop) -> bool:
@@ -219,6 +223,12 @@ def _chosen(
             others = [n for n in kept if not _rival(n, name, rivals)]
             beside[name] = loop.gap_nm({n: values[n] for n in (*others, name)})
     return kept, gap_nm, beside
+
+
+def helping(found: Sequence[Finding], gap_nm: Callable[[Effects], float], floor_nm: float) -> list[Finding]:
+    """Those causes that bring the simulated joint nearer, by the gap that effects leave of it."""
+    kept, _ = _added(told_numbers(found), {f.effect: f.rivals for f in found}, Loop(gap_nm, gap_nm({}), floor_nm))
+    return [f for f in found if f.effect in kept]
 
 
 def _rival(one: str, other: str, rivals: Mapping[str, Sequence[str]]) -> bool:

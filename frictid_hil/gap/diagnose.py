@@ -8,31 +8,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import numpy as np
-
-from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replayed
 from frictid_hil.gap.borne_out import BorneOut, Loop, borne_out
 from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, below_first_pair
-from frictid_hil.gap.channel import Channel
-from frictid_hil.gap.diagnosis import Diagnosis, Value
+from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
-from frictid_hil.gap.findings import EVEN, Finding, Sampled, findings, numbers, sampled, told_numbers
+from frictid_hil.gap.findings import Finding, numbers, told_numbers
 from frictid_hil.gap.forward import Simulation, pooled
-from frictid_hil.gap.how_far import Closed, closed
-from frictid_hil.gap.loop_channel import loop_channel
-from frictid_hil.gap.plant_channel import plant_channel
-from frictid_hil.gap.posterior import Posterior
+from frictid_hil.gap.how_far import Closed
 from frictid_hil.gap.prepared import Prepared, prepared
 from frictid_hil.gap.quiet import NEGLIGIBLE, negligible_nm, quiet_before_any_filter, quiet_in_the_loop
-from frictid_hil.gap.residuals import rms
+from frictid_hil.gap.reading import (
+    COARSE,
+    Reading,
+    along_the_motion,
+    beside_a_link,
+    gaps_left,
+    in_the_better_way,
+    in_the_loop,
+    without_links,
+)
 from frictid_hil.gap.told import told
-from frictid_hil.gap.tracking_channel import tracking_channel
 from frictid_hil.gap.verdict import (
-    FLOORS,
     HALF,
-    READ_DIRECTLY,
+    LISTED,
     REMAINS,
     SHOWS,
     TIED,
@@ -43,29 +43,7 @@ from frictid_hil.gap.verdict import (
 )
 from frictid_hil.simulation.effects import all_effects
 
-COARSE = 0.7
-"""Noise of the closed loop over that along the motion, half in power, below which a quiet motion may hide a cause."""
-HIDES = "its steps hide along the motion what the controller answers to: causes are read from the closed loop's torque"
-STIFF = "read without links that swing: so the simulated joint comes nearer to its recording"
-READ = 0.97  # chance of what is read from reported positions and velocities themselves
 UNDECIDED = 0.5  # most that is claimed of causes that a motion or the lack of a second log cannot tell apart
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Reading:
-    """What the recordings say, read in one way."""
-
-    allowed: Sequence[str]  # effects that may be used
-    channels: Sequence[Sampled]
-    found: Sequence[Finding]  # causes
-    gaps: Sequence[Closed]  # of each channel, without causes and with those that are likelier there than not
-    reasons: Mapping[str, str]  # what cannot be told, by name
-    along: Sampled | None = None  # the plant channel where the loop channel stands in its place
-
-    @property
-    def measured(self) -> Sequence[Sampled]:
-        """The channels along the measured motion."""
-        return self.channels if self.along is None else [self.along, *self.channels[1:]]
 
 
 def diagnose(
@@ -76,13 +54,14 @@ def diagnose(
     ``negligible`` is the gap that the user calls none, as a share of the friction level.
 
     The closed loop judges how the recordings were read. Where the causes leave a gap there, they are read once more
-    without links that swing, as their columns lose the phase along a motion, and by what the loop's torque says, as a
-    coarse encoder hides much of it along the motion. The answer that brings the simulated joint nearer is given.
+    without links that swing, as their columns lose the phase along a motion, then beside the link that the closed loop
+    itself tells, and by what the loop's torque says, as a coarse encoder hides much of it along the motion. The answer
+    that brings the simulated joint nearer is given.
     """
     allowed = tuple(n for n in all_effects() if library is None or n in library)
     joint = prepared(experiments, allowed)
-    along = _along(joint, allowed)
-    best = _answer(joint, _best(joint, along), negligible)
+    along = along_the_motion(joint, allowed)
+    best = _answer(joint, in_the_better_way(joint, along), negligible)
     if best.verdict == "none" or not _leaves(best, REMAINS):
         return best
     for reading in _others(joint, along, best):
@@ -90,17 +69,21 @@ def diagnose(
         closes = best.verdict == "explained" or not _leaves(other, HALF)
         if other.verdict == "explained" and closes and _nearer(other, best):
             best = other
+        if not _leaves(best, REMAINS):
+            return best
     return best
 
 
 def _others(joint: Prepared, along: Reading, answer: Diagnosis) -> Iterator[Reading]:
     """Other ways to read the recordings that led to an answer."""
     if any(swings(cause.effect) for cause in answer.causes):
-        stiff = _along(joint, [n for n in along.allowed if not swings(n)])
-        yield _best(joint, replace(stiff, reasons={**stiff.reasons, "link": STIFF}))
+        stiff = without_links(joint, along)
+        yield in_the_better_way(joint, stiff)
+        if (loose := beside_a_link(joint, stiff, along.allowed)) is not None:
+            yield loose
     along_nm, loop_nm = answer.noise_floor.inverse_nm, answer.noise_floor.forward_torque_nm
     coarse = along_nm is not None and loop_nm is not None and loop_nm < COARSE * along_nm
-    if coarse and "encoder" not in answer.reasons and (loop := _in_loop(joint, along)) is not None:
+    if coarse and "encoder" not in answer.reasons and (loop := in_the_loop(joint, along)) is not None:
         yield loop
 
 
@@ -124,68 +107,6 @@ def _squares(told: Diagnosis) -> tuple[float, float]:
     return after**2 - noise**2, max(before**2 - noise**2, noise**2)
 
 
-def _along(joint: Prepared, allowed: Sequence[str]) -> Reading:
-    """What the recordings say along the measured motion."""
-    reasons = dict(joint.reasons)
-    channels = [sampled(Posterior(c, len(allowed))) for c in _channels(joint, allowed, reasons)]
-    return Reading(allowed, channels, *_read(channels, joint), reasons)
-
-
-def _channels(joint: Prepared, allowed: Sequence[str], reasons: dict[str, str]) -> list[Channel]:
-    """The channels that these recordings have."""
-    plant = plant_channel(joint.nominal, joint.logs, allowed, reasons, joint.believed, joint.stepped)
-    if plant is None:
-        reasons["inverse_nm"] = "no log has a torque"
-        reasons["forward_position_rad"] = "position against the command through a fitted chain, not a replay"
-        tracking = tracking_channel(joint.logs, allowed)
-        return [] if tracking is None else [tracking]
-    actuation = actuation_channel(joint.nominal, joint.logs, allowed, joint.kinematic, joint.believed)
-    if actuation is None:
-        reasons["actuation"] = why_not_replayed(joint.nominal, joint.logs) or "no log has torque and demand"
-    return [plant] if actuation is None else [plant, actuation]
-
-
-def _read(channels: Sequence[Sampled], joint: Prepared) -> tuple[list[Finding], list[Closed]]:
-    """(causes, gap of each channel without them and with those that are likelier there than not)."""
-    found = _with_readings(findings(channels), channels, joint)
-    return found, _closed(channels, found)
-
-
-def _closed(channels: Sequence[Sampled], named: Sequence[Finding]) -> list[Closed]:
-    """The gap of each channel without and with the causes that are likelier there than not."""
-    return [closed(c, [f.effect for f in named if f.confidence >= EVEN]) for c in channels]
-
-
-def _best(joint: Prepared, along: Reading) -> Reading:
-    """What the closed loop says where no gap shows along the motion, and noise there is much louder than the loop's."""
-    if joint.simulation is None:
-        return along
-    plant, gap = along.channels[0].posterior, along.gaps[0]
-    louder = joint.simulation.noise_nm < COARSE * min(plant.floor, plant.channel.known_floor)
-    loop = _in_loop(joint, along) if louder and gap.before <= FLOORS * gap.floor else None
-    return along if loop is None else loop
-
-
-def _in_loop(joint: Prepared, along: Reading) -> Reading | None:
-    """What the closed loop's torque says, with what shows between demand and torque simulated beside.
-
-    None where that runs away, where nothing can be simulated, and where a link swings by itself: that is no small
-    change of the loop.
-    """
-    likely = [f for f in along.found if f.chance >= EVEN]
-    if joint.simulation is None or not joint.believed or any(swings(f.effect) for f in likely):
-        return None
-    beside = told_numbers(f for f in likely if f.where == "actuation")
-    steady = [name for name in along.allowed if not swings(name)]
-    plant, *others = along.channels
-    raw = plant.posterior.channel.raw
-    loop = loop_channel(joint.nominal, joint.believed, joint.simulation, beside, steady, along.reasons, raw)
-    if loop is None:
-        return None
-    channels = [sampled(Posterior(loop, len(along.allowed))), *others]
-    return Reading(along.allowed, channels, *_read(channels, joint), {**along.reasons, "encoder": HIDES}, plant)
-
-
 def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     """What is said of one reading."""
     channels, gaps, reasons = reading.channels, reading.gaps, dict(reading.reasons)
@@ -195,6 +116,9 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
         quiet = quiet_in_the_loop(joint.simulation, reading.found, channels, gaps, nothing_nm)
     still = joint.guessed and _still(joint.simulation, gaps)
     said = verdict(reading.found, channels, gaps, nothing_nm, quiet, joint.simulation is not None, still)
+    if reading.loose:
+        # A link that the closed loop tells is for the closed loop to judge.
+        said = Verdict("unknown", tuple(f for f in reading.found if f.chance >= LISTED), said.place)
     if (warning := below_first_pair(said.named, joint.nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if joint.simulation is not None and said.named and said.word != "none":
@@ -204,9 +128,9 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
         said = _ranked(borne.said, joint.simulation, gaps, guessed=joint.guessed, borne=borne)
         if borne.told is not None:
             reasons["closed_loop"] = borne.told
-            gaps = _closed(channels, said.named)
+            gaps = gaps_left(channels, said.named)
     said = _cautious(said, reasons, any(r.experiment.validation for r in joint.logs))
-    gaps = gaps if reading.along is None else [*gaps, *_closed([reading.along], said.named)]
+    gaps = gaps if reading.along is None else [*gaps, *gaps_left([reading.along], said.named)]
     return told(joint, channels, gaps, said, reasons)
 
 
@@ -215,37 +139,6 @@ def _open_along(reading: Reading) -> bool:
     every = (c.posterior.channel for c in reading.measured)
     loose = {c.name for c in every if c.of_the_joint or c.between_rows} | {"loop"}
     return any(gap.channel in loose and stays(gap, HALF, floors=1.0) for gap in reading.gaps)
-
-
-def _with_readings(found: list[Finding], channels: Sequence[Sampled], joint: Prepared) -> list[Finding]:
-    """The findings with what the kinematic channel reads directly."""
-    if not channels or not joint.kinematic:
-        return found
-    made = [r.kinematic_rad_s for r in joint.logs if r.kinematic_rad_s is not None]
-    gain = joint.nominal.controller.kd_nm_s_per_rad if joint.nominal.controller is not None else 0.0
-    for name, value in joint.kinematic.items():
-        form = all_effects()[name].kinematic
-        assert form is not None
-        size = (
-            gain * rms(np.concatenate(made)) / channels[0].posterior.floor if made and not form.position_step else 1.0
-        )
-        told = {form.parameter: Value(value, 0.95 * value, 1.05 * value)}
-        others = [f for f in found if f.effect != name]
-        if form.in_loop and joint.simulation is not None:
-            told[form.in_loop] = Value(
-                _loop_share(name, {form.parameter: value}, form.in_loop, others, joint.simulation)
-            )
-        found = [*others, Finding(name, READ, READ, max(size, 1.0), 0.0, told, (), READ_DIRECTLY)]
-    return sorted(found, key=lambda f: -f.size)
-
-
-def _loop_share(
-    name: str, values: Mapping[str, float], share: str, others: Sequence[Finding], simulation: Simulation
-) -> float:
-    """Whether the controller acts on what is reported, 1 or 0: as the simulated joint comes nearer to its recording."""
-    beside = told_numbers(f for f in others if f.chance >= EVEN)
-    gaps_nm = {acts: simulation.fitted_gap_nm({**beside, name: {**values, share: acts}}) for acts in (0.0, 1.0)}
-    return min(gaps_nm, key=lambda acts: gaps_nm[acts])
 
 
 def _ranked(

@@ -20,6 +20,11 @@ class Value:
     low: float | None = None
     high: float | None = None
 
+    def moved(self, more: float) -> Value:
+        """The number and its interval, larger by ``more``."""
+        low, high = (None if end is None else end + more for end in (self.low, self.high))
+        return Value(self.value + more, low, high)
+
 
 @dataclass(frozen=True, slots=True)
 class Cause:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -138,13 +138,16 @@ class Replay:
             merged[name] = {**merged.get(name, {}), **bounded(name, values)}
         return self._nominal.with_effects(merged)
 
-    def __call__(self, effects: Effects, *, validation: bool | None = None) -> dict[str, Replayed]:
+    def __call__(
+        self, effects: Effects, *, validation: bool | None = None, only: Collection[str] | None = None
+    ) -> dict[str, Replayed]:
         """Differences by experiment name, of validation logs only, of the others only, or of all (None).
 
-        Warmth carries over in run order, so earlier logs are simulated too where an effect remembers. What was replayed
-        once is held.
+        Of those ``only`` the named ones, where names are given. Warmth carries over in run order, so earlier logs are
+        simulated too where an effect remembers. What was replayed once is held.
         """
         wanted = [e.name for e in self._experiments if validation is None or e.validation == validation]
+        wanted = [name for name in wanted if only is None or name in only]
         held = self._held.setdefault(_key(effects), {})
         if missing := [name for name in wanted if name not in held]:
             carried = any(all_effects()[name].carried for name in effects)
@@ -246,11 +249,22 @@ class Simulation:
 
     def fitted_gap_nm(self, effects: Effects) -> float:
         """The same of the logs that numbers are read from."""
-        return self._gap_nm(effects, False if self.replay.identifies else None)
+        return self._gap_nm(effects, self._fitted)
 
-    def _gap_nm(self, effects: Effects, validation: bool | None) -> float:
+    def loudest_gap_nm(self, count: int) -> Callable[[Effects], float]:
+        """The same of as many of those logs as ``count``, the ones that show most of the gap."""
+        bare = self.replay({}, validation=self._fitted)
+        squares = {name: float(np.sum(run.torque_nm[run.settled :] ** 2)) for name, run in bare.items()}
+        names = sorted(squares, key=lambda name: -squares[name])[:count]
+        return lambda effects: self._gap_nm(effects, self._fitted, names)
+
+    @property
+    def _fitted(self) -> bool | None:
+        return False if self.replay.identifies else None
+
+    def _gap_nm(self, effects: Effects, validation: bool | None, only: Collection[str] | None = None) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
-            gap = pooled(self.replay(effects, validation=validation), "torque_nm")
+            gap = pooled(self.replay(effects, validation=validation, only=only), "torque_nm")
         return gap if math.isfinite(gap) else math.inf
 
 

@@ -53,6 +53,8 @@ class ActuationForm:
     # A further parameter, ``torque``'s fifth argument, that shapes the effect; empty where there is none.
     detail: str = ""
     details: tuple[float, ...] = ()  # values of it to try, the plainest first; it stays where no other predicts better
+    # Ticks of the controller by which it may be later than the reported torque tells; the closed loop decides it.
+    unreported_ticks: float = 0.0
     # Key in the ``drive`` section of nominal.yaml that already states it; empty where there is none.
     believed_as: str = ""
 

@@ -17,6 +17,7 @@ from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.diagnosis import Figures
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, pooled
+from frictid_hil.gap.reading import HIDES, Reading
 from frictid_hil.gap.residuals import LowPass, recordings, rms
 
 SINGLES = {
@@ -277,10 +278,10 @@ def test_the_closed_loop_judges_how_the_recordings_were_read(
     along, other = left_nm
 
     def along_motion(_: object, allowed: Sequence[str]) -> Any:
-        return diagnosis.Reading(tuple(allowed), (), (), (), {"name": along if along in allowed else other})
+        return Reading(tuple(allowed), (), (), (), {"name": along if along in allowed else other})
 
     def in_loop(_: object, reading: Any) -> Any:
-        return replace(reading, reasons={"name": other, "encoder": diagnosis.HIDES})
+        return replace(reading, reasons={"name": other, "encoder": HIDES})
 
     def answered(_: object, reading: Any, __: float) -> SimpleNamespace:
         name = reading.reasons["name"]
@@ -291,8 +292,9 @@ def test_the_closed_loop_judges_how_the_recordings_were_read(
         )  # fmt: skip
 
     monkeypatch.setattr(diagnosis, "prepared", lambda *_: None)
-    monkeypatch.setattr(diagnosis, "_best", lambda _, reading: reading)
-    for name, stand_in in (("_along", along_motion), ("_in_loop", in_loop), ("_answer", answered)):
+    monkeypatch.setattr(diagnosis, "in_the_better_way", lambda _, reading: reading)
+    monkeypatch.setattr(diagnosis, "beside_a_link", lambda *_: None)
+    for name, stand_in in (("along_the_motion", along_motion), ("in_the_loop", in_loop), ("_answer", answered)):
         monkeypatch.setattr(diagnosis, name, stand_in)
     answer = diagnose(cast(ExperimentSet, None))
     assert answer.causes[0].effect == first

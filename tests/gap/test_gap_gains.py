@@ -46,6 +46,19 @@ def test_each_gain_is_found_and_the_loop_closes(controller: Controller) -> None:
     assert found.after.forward_torque_nm < 0.2 * found.before.forward_torque_nm
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("late", ["electrical_lag", "torque_delay"])
+def test_a_late_drive_is_late_with_what_wrong_gains_ask_for(late: str) -> None:
+    """Neither is told by itself: the gains were 11 % off, and a lag of 58 noise floors was ``unknown``."""
+    parameter = "time_constant_s" if late == "electrical_lag" else "delay_s"
+    found = told(PID, 2e-6, **{late: {parameter: 0.006}})
+    causes = {c.effect: c.parameters for c in found.causes if c.confidence > 0.8}
+    assert found.verdict == "explained" and causes.keys() == {"controller_gain_error", late}
+    assert causes[late][parameter].value == pytest.approx(0.006, abs=0.0004)
+    for name, share in SHARES.items():
+        assert causes["controller_gain_error"][name].value == pytest.approx(share, abs=0.01)
+
+
 def test_the_limit_is_reached() -> None:
     (log, *_) = gap_sets.make({}, replace(gap_sets.NOMINAL, controller=LIMITED), only=("sines_large",)).experiments
     assert log.torque_nm is not None and np.max(np.abs(log.torque_nm)) > 0.98 * LIMITED.torque_limit_nm

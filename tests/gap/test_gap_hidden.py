@@ -70,6 +70,22 @@ def test_a_delay_that_is_over_when_the_torque_is_reported_is_found_in_the_plant(
 
 
 @pytest.mark.slow
+def test_a_delay_that_the_report_tells_in_whole_ticks_is_found_whole() -> None:
+    """Torque is reported as it is at a tick, so that it shows 4 ms of 5.4: the tick to come has yet to act."""
+    made = gap_sets.make({"torque_delay": {"delay_s": 0.0054}}, noise_nm=0.0)
+    random = np.random.default_rng(3)
+
+    def early(e: Experiment) -> Experiment:
+        assert e.torque_nm is not None
+        torque = np.interp(e.time_s + 0.0014, e.time_s, e.torque_nm)
+        return replace(e, torque_nm=torque + 0.02 * random.standard_normal(torque.size))
+
+    found = diagnose(replace(made, experiments=tuple(early(e) for e in made.experiments)))
+    assert found.verdict == "explained" and found.causes[0].effect == "torque_delay"
+    assert found.causes[0].parameters["delay_s"].value == pytest.approx(0.0054, abs=0.0006)
+
+
+@pytest.mark.slow
 def test_a_coarse_encoder_is_not_taken_for_friction() -> None:
     found = diagnose(gap_sets.make({"encoder_quantisation": {"step_rad": 4e-4}}))
     assert [c.effect for c in found.causes][:1] == ["encoder_quantisation"]
@@ -88,7 +104,7 @@ def test_a_round_knee_approaches_the_clip() -> None:
 
 def _drawn(effects: tuple[str, ...], index: int, seed: int, folder: Path) -> ExperimentSet:
     """A joint of the blind world, whose plant shares no formula with the diagnosis."""
-    write_case(draw_case(index, seed, Assignment("double", effects)), folder)
+    write_case(draw_case(index, seed, Assignment("single" if len(effects) == 1 else "double", effects)), folder)
     return ExperimentSet.load(folder)
 
 
@@ -184,3 +200,22 @@ def test_a_log_that_lacks_ticks_folds_the_jumps_of_a_coarse_encoders_torque_into
     smooth, stepped = believed_joint(unstated, simulated_joint(unstated, logs))
     alone, both = (plant_channel(unstated.nominal, logs, (), (), smooth, steps) for steps in ((), stepped))
     assert alone is not None and both is not None and 0.0 < alone.known_floor == both.known_floor
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("effects", "index", "play_rad"),
+    [(("backlash",), 96, 0.0138), (("temperature_drift", "backlash"), 98, 0.00455)],
+    ids=["alone", "beside drift"],
+)
+def test_play_whose_phase_is_lost_along_the_motion_is_sought_in_closed_loop(
+    tmp_path: Path, effects: tuple[str, ...], index: int, play_rad: float
+) -> None:
+    """Both were ``unknown``: along the motion wrong gravity, torque constant and efficiency stood in for it."""
+    found = diagnose(_drawn(effects, index, 114707, tmp_path))
+    assert found.verdict == "explained" and "link" in found.reasons
+    assert {c.effect for c in found.causes[: len(effects)]} == set(effects)
+    play = next(c for c in found.causes if c.effect == "backlash").parameters["gap_rad"]
+    assert play.value == pytest.approx(play_rad, rel=0.15)
+    before, after = (f.forward_torque_nm for f in (found.before, found.after))
+    assert before is not None and after is not None and after < 0.33 * before

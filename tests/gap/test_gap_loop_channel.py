@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.diagnose import HIDES, diagnose
+from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import Nominal
 from frictid_hil.gap.forward import Effects, Replay, Simulation
 from frictid_hil.gap.linear_loop import answered
 from frictid_hil.gap.loop_channel import STANDS_S, drift_nm, loop_channel
+from frictid_hil.gap.reading import HIDES
 from frictid_hil.gap.residuals import LowPass, recordings, rms
 from frictid_hil.simulation.effects import all_effects
 

@@ -82,7 +82,16 @@ EFFECT = Effect(
         {"demand": lambda t: np.where(t >= 0.0, 1.0, 0.0), "torque": lambda t: np.where(t >= p["delay_s"], 1.0, 0.0)},
     ),
     belief="torque_delay_s",
-    actuation=ActuationForm("delay_s", guesses_by_sample, reported, order=20, late=True, believed_as="torque_delay_s"),
+    actuation=ActuationForm(
+        "delay_s",
+        guesses_by_sample,
+        reported,
+        order=20,
+        late=True,
+        # A torque reported as it is at a tick shows a delay in whole ticks: the one to come has yet to act.
+        unreported_ticks=1.0,
+        believed_as="torque_delay_s",
+    ),
     inverse=InverseForm(
         shapes=({"sample_s": 0.0},),
         # What a torque that acts up to one sample later than it is reported leaves in the plant, per sample.

@@ -1,0 +1,185 @@
+"""What the recordings say, read in one way.
+
+Along the measured motion, from the torque of the closed loop, or from that beside a link that swings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replayed
+from frictid_hil.gap.channel import Channel
+from frictid_hil.gap.diagnosis import Value
+from frictid_hil.gap.findings import EVEN, Finding, Sampled, findings, sampled, told_numbers
+from frictid_hil.gap.forward import Simulation
+from frictid_hil.gap.how_far import Closed, closed
+from frictid_hil.gap.link_in_loop import link_in_loop
+from frictid_hil.gap.loop_channel import loop_channel
+from frictid_hil.gap.plant_channel import plant_channel
+from frictid_hil.gap.posterior import Posterior
+from frictid_hil.gap.prepared import Prepared
+from frictid_hil.gap.residuals import rms
+from frictid_hil.gap.tracking_channel import tracking_channel
+from frictid_hil.gap.verdict import FLOORS, READ_DIRECTLY, swings
+from frictid_hil.simulation.effects import all_effects
+
+COARSE = 0.7
+"""Noise of the closed loop over that along the motion, half in power, below which a quiet motion may hide a cause."""
+HIDES = "its steps hide along the motion what the controller answers to: causes are read from the closed loop's torque"
+STIFF = "read without links that swing: so the simulated joint comes nearer to its recording"
+SOUGHT = "sought in closed loop: along the motion causes of a rigid joint stand in for a link that swings"
+UNREPORTED = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of what a drive may be later than it reports that are tried
+READ = 0.97  # chance of what is read from reported positions and velocities themselves
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """What the recordings say, read in one way."""
+
+    allowed: Sequence[str]  # effects that may be used
+    channels: Sequence[Sampled]
+    found: Sequence[Finding]  # causes
+    gaps: Sequence[Closed]  # of each channel, without causes and with those that are likelier there than not
+    reasons: Mapping[str, str]  # what cannot be told, by name
+    along: Sampled | None = None  # the plant channel where the loop channel stands in its place
+    # A link that swings, sought in closed loop, and what helps beside it: the first of the causes.
+    loose: Sequence[Finding] = ()
+
+    @property
+    def measured(self) -> Sequence[Sampled]:
+        """The channels along the measured motion."""
+        return self.channels if self.along is None else [self.along, *self.channels[1:]]
+
+
+def along_the_motion(joint: Prepared, allowed: Sequence[str]) -> Reading:
+    """What the recordings say along the measured motion."""
+    reasons = dict(joint.reasons)
+    channels = [sampled(Posterior(c, len(allowed))) for c in _channels(joint, allowed, reasons)]
+    return Reading(allowed, channels, *_read(channels, joint), reasons)
+
+
+def without_links(joint: Prepared, along: Reading) -> Reading:
+    """The same without causes that let a link swing; they show nowhere but in the joint itself."""
+    allowed = [name for name in along.allowed if not swings(name)]
+    reasons = {**along.reasons, "link": STIFF}
+    plant = plant_channel(joint.nominal, joint.logs, allowed, reasons, joint.believed, joint.stepped)
+    assert plant is not None
+    channels = [sampled(Posterior(plant, len(allowed))), *along.channels[1:]]
+    return Reading(allowed, channels, *_read(channels, joint), reasons)
+
+
+def _channels(joint: Prepared, allowed: Sequence[str], reasons: dict[str, str]) -> list[Channel]:
+    """The channels that these recordings have."""
+    plant = plant_channel(joint.nominal, joint.logs, allowed, reasons, joint.believed, joint.stepped)
+    if plant is None:
+        reasons["inverse_nm"] = "no log has a torque"
+        reasons["forward_position_rad"] = "position against the command through a fitted chain, not a replay"
+        tracking = tracking_channel(joint.logs, allowed)
+        return [] if tracking is None else [tracking]
+    actuation = actuation_channel(joint.nominal, joint.logs, allowed, joint.kinematic, joint.believed)
+    if actuation is None:
+        reasons["actuation"] = why_not_replayed(joint.nominal, joint.logs) or "no log has torque and demand"
+    return [plant] if actuation is None else [plant, actuation]
+
+
+def _read(channels: Sequence[Sampled], joint: Prepared) -> tuple[list[Finding], list[Closed]]:
+    """(causes, gap of each channel without them and with those that are likelier there than not)."""
+    found = _as_late(_with_readings(findings(channels), channels, joint), joint)
+    return found, gaps_left(channels, found)
+
+
+def gaps_left(channels: Sequence[Sampled], named: Sequence[Finding]) -> list[Closed]:
+    """The gap of each channel without and with the causes that are likelier there than not."""
+    return [closed(c, [f.effect for f in named if f.confidence >= EVEN]) for c in channels]
+
+
+def in_the_better_way(joint: Prepared, along: Reading) -> Reading:
+    """What the closed loop says where no gap shows along the motion, and noise there is much louder than the loop's."""
+    if joint.simulation is None:
+        return along
+    plant, gap = along.channels[0].posterior, along.gaps[0]
+    louder = joint.simulation.noise_nm < COARSE * min(plant.floor, plant.channel.known_floor)
+    loop = in_the_loop(joint, along) if louder and gap.before <= FLOORS * gap.floor else None
+    return along if loop is None else loop
+
+
+def beside_a_link(joint: Prepared, stiff: Reading, allowed: Sequence[str]) -> Reading | None:
+    """What the closed loop says beside the link that it tells itself; None where it tells none."""
+    loose = [] if joint.simulation is None else link_in_loop(stiff.found, joint.simulation, allowed)
+    return in_the_loop(joint, stiff, loose) if loose else None
+
+
+def in_the_loop(joint: Prepared, along: Reading, loose: Sequence[Finding] = ()) -> Reading | None:
+    """What the closed loop's torque says, with what shows between demand and torque simulated beside, and ``loose``.
+
+    None where that runs away, where nothing can be simulated, and where a link swings by itself: that is no small
+    change of the loop.
+    """
+    likely = [f for f in along.found if f.chance >= EVEN]
+    if joint.simulation is None or not joint.believed or any(swings(f.effect) for f in likely):
+        return None
+    beside = told_numbers([*(f for f in likely if f.where == "actuation"), *loose])
+    steady = [name for name in along.allowed if not swings(name)]
+    plant, *others = along.channels
+    raw = plant.posterior.channel.raw
+    loop = loop_channel(joint.nominal, joint.believed, joint.simulation, beside, steady, along.reasons, raw)
+    if loop is None:
+        return None
+    channels = [sampled(Posterior(loop, len(along.allowed))), *others]
+    found, gaps = _read(channels, joint)
+    if loose:
+        found = [*loose, *(f for f in found if f.effect not in {one.effect for one in loose})]
+        return Reading(along.allowed, channels, found, gaps, {**along.reasons, "link": SOUGHT}, plant, loose)
+    return Reading(along.allowed, channels, found, gaps, {**along.reasons, "encoder": HIDES}, plant)
+
+
+def _with_readings(found: list[Finding], channels: Sequence[Sampled], joint: Prepared) -> list[Finding]:
+    """The findings with what the kinematic channel reads directly."""
+    if not channels or not joint.kinematic:
+        return found
+    made = [r.kinematic_rad_s for r in joint.logs if r.kinematic_rad_s is not None]
+    gain = joint.nominal.controller.kd_nm_s_per_rad if joint.nominal.controller is not None else 0.0
+    for name, value in joint.kinematic.items():
+        form = all_effects()[name].kinematic
+        assert form is not None
+        size = (
+            gain * rms(np.concatenate(made)) / channels[0].posterior.floor if made and not form.position_step else 1.0
+        )
+        told = {form.parameter: Value(value, 0.95 * value, 1.05 * value)}
+        others = [f for f in found if f.effect != name]
+        if form.in_loop and joint.simulation is not None:
+            told[form.in_loop] = Value(
+                _loop_share(name, {form.parameter: value}, form.in_loop, others, joint.simulation)
+            )
+        found = [*others, Finding(name, READ, READ, max(size, 1.0), 0.0, told, (), READ_DIRECTLY)]
+    return sorted(found, key=lambda f: -f.size)
+
+
+def _loop_share(
+    name: str, values: Mapping[str, float], share: str, others: Sequence[Finding], simulation: Simulation
+) -> float:
+    """Whether the controller acts on what is reported, 1 or 0: as the simulated joint comes nearer to its recording."""
+    beside = told_numbers(f for f in others if f.chance >= EVEN)
+    gaps_nm = {acts: simulation.fitted_gap_nm({**beside, name: {**values, share: acts}}) for acts in (0.0, 1.0)}
+    return min(gaps_nm, key=lambda acts: gaps_nm[acts])
+
+
+def _as_late(found: list[Finding], joint: Prepared) -> list[Finding]:
+    """The findings, a drive as much later than its torque tells as brings the simulated joint nearest."""
+    controller, told = joint.nominal.controller, told_numbers(f for f in found if f.chance >= EVEN)
+    if joint.simulation is None or controller is None:
+        return found
+    result = []
+    for cause in found:
+        form = all_effects()[cause.effect].actuation
+        if form is not None and form.unreported_ticks and cause.where == "actuation" and cause.effect in told:
+            name, read_s = form.parameter, told[cause.effect][form.parameter]
+            late_s = [read_s + share * form.unreported_ticks / controller.rate_hz for share in UNREPORTED]
+            nm = {late: joint.simulation.fitted_gap_nm({**told, cause.effect: {name: late}}) for late in late_s}
+            more_s = min(nm, key=lambda late: nm[late]) - read_s
+            cause = replace(cause, parameters={**cause.parameters, name: cause.parameters[name].moved(more_s)})
+        result.append(cause)
+    return result
