@@ -198,3 +198,13 @@ def test_a_joint_that_rings_at_rest_has_no_swapped_sign() -> None:
     assert checked(ExperimentSet("rings", Nominal(), (log,))).experiments
     with pytest.raises(InputFileError, match="opposite signs"):
         checked(ExperimentSet("swapped", Nominal(), (replace(log, torque_nm=-0.4 * moving - 0.01),)))
+
+
+def test_a_bias_larger_than_friction_is_no_swapped_sign_of_a_motor_that_spins_one_way() -> None:
+    """The position's noise goes back a little in most rows."""
+    random = np.random.default_rng(1)
+    time = 0.001 * np.arange(4000)
+    position = 5.0 * time + 2e-3 * random.standard_normal(time.size)
+    torque = 0.1 - 0.5 + 0.05 * random.standard_normal(time.size)
+    log = Experiment("spins", False, False, 0, time, position, torque_nm=torque)
+    assert checked(ExperimentSet("spins", Nominal(), (log,))).experiments
