@@ -37,6 +37,7 @@ from frictid_hil.gap import (
     how_far,
     kinematics,
     linear_loop,
+    link_in_loop,
     loop_channel,
     noise,
     nuisances,
@@ -64,7 +65,8 @@ LATE: tuple[tuple[ModuleType, str], ...] = (
     (verdict, "FLOORS"), (verdict, "AS_STATED"), (verdict, "MOST_EXPECTED"), (verdict, "FLOORS_AS_STATED"),
     (verdict, "STANDS_OUT"), (verdict, "REMAINS"), (verdict, "DOUBTED"), (verdict, "HALF"),
     (verdict, "LISTED"), (verdict, "NEEDED"), (verdict, "CERTAIN"), (verdict, "EVEN"), (verdict, "LEADS"),
-    (borne_out, "BOUNCED"), (borne_out, "REFUTED"), (borne_out, "FAR"),
+    (verdict, "FORMS_OFF"),
+    (borne_out, "BOUNCED"), (borne_out, "REFUTED"), (borne_out, "FAR"), (link_in_loop, "LOGS"),
     (how_far, "COLOUR"), (how_far, "APPEARED"), (how_far, "WINDOW_S"),
     (quiet, "NEGLIGIBLE"), (quiet, "LOUD"), (diagnosis, "UNDECIDED"),
 )  # fmt: skip

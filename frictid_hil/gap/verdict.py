@@ -12,7 +12,7 @@ import numpy as np
 from frictid_hil.gap.channel import FAMILY, Term
 from frictid_hil.gap.findings import EVEN, Finding, Sampled
 from frictid_hil.gap.how_far import Closed, coefficients
-from frictid_hil.gap.posterior import VISIBLE, Draw
+from frictid_hil.gap.posterior import VISIBLE, Draw, form_of
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -29,6 +29,7 @@ DOUBTED = 0.89
 """Most that is claimed of causes beyond a tolerance that leave a part of the gap, or close one that functions without
 a name would describe as well: less than what counts as sure. Of 41 drawn causes that were held at it, 36 were there."""
 HALF = 0.5  # part of a gap from which on it is open although causes were named
+FORMS_OFF = 2.0  # one-sigma of a form by which it may well be off
 HELPS = 0.98  # gap of the validation logs with the causes over that without, above which they explain nothing there
 READ_DIRECTLY = "kinematics"  # where a cause is read from positions and velocities themselves
 TIED = 0.45  # chance of each of two causes that recordings make alike, a little left for a third
@@ -96,7 +97,7 @@ def verdict(
         return Verdict("unknown", named or tuple(f for f in found if f.chance >= LISTED and swings(f.effect)), place)
     if (varies := next((f for f in named if f.chance >= EVEN and _varies(f, channels)), None)) is not None:
         return Verdict("unknown", named, f"{varies.where}: {varies.effect} that comes and goes")
-    if _unnamed(loud) or any(stays(gap, REMAINS) for gap in gaps):
+    if _unnamed(loud) or _off_its_form(loud) or any(stays(gap, REMAINS) for gap in gaps):
         # What stays may be of another cause. An error within its tolerance is to be expected, whatever else is there.
         named = tuple(f if expected(f, channels) else f.at_most(DOUBTED) for f in named)
     first = named[0]
@@ -214,6 +215,14 @@ def _unnamed(loud: Sequence[Sampled]) -> bool:
     """Whether what has no name is a fair part of what channels with a gap hold."""
     generic, explained = _root_sum([c.generic for c in loud]), _root_sum([c.explained for c in loud])
     return float(np.mean(generic > np.maximum(VISIBLE, REMAINS * explained))) > 0.5
+
+
+def _off_its_form(loud: Sequence[Sampled]) -> bool:
+    """Whether what has no name is more than the causes' forms may well be off by: then they may be other causes."""
+    off = _root_sum(
+        [FORMS_OFF * form_of(name) * sizes for c in loud for name, sizes in c.sizes.items()] or [np.zeros(1)]
+    )
+    return float(np.mean(_root_sum([c.generic for c in loud]) > np.maximum(VISIBLE, off))) > 0.5
 
 
 def stays(gap: Closed, part: float, floors: float = FLOORS) -> bool:
