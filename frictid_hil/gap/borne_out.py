@@ -130,11 +130,15 @@ def _closed(
     said: Verdict, values: Effects, kept: Sequence[str], gap_nm: float, loop: Loop
 ) -> tuple[Verdict, str | None]:
     """What has no name along the motion is no part of the gap where the causes close the loop."""
+    if any(swings(name) for name in values) and _stays(REMAINS, gap_nm, loop):
+        rescued, told = _rescued(said, values, kept, loop)
+        if told is not None:
+            return rescued, told
     shows = loop.before_nm > FLOORS * loop.floor_nm
     if kept and shows and not _stays(_may_stay(kept), gap_nm, loop) and not said.place.startswith("actuation"):
         named = sorted(said.named, key=lambda f: f.effect not in kept)
         return _doubted(Verdict("explained", tuple(named))), _told(kept, set(), loop, gap_nm)
-    return _rescued(said, values, kept, loop) if any(swings(name) for name in values) else (said, None)
+    return said, None
 
 
 def _none_of_these(said: Verdict, kept: Sequence[str]) -> Verdict:

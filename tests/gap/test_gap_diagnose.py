@@ -17,7 +17,7 @@ from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.diagnosis import Figures
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, pooled
-from frictid_hil.gap.reading import HIDES, Reading
+from frictid_hil.gap.reading import HIDES, STIFF, Reading
 from frictid_hil.gap.residuals import LowPass, recordings, rms
 
 SINGLES = {
@@ -280,6 +280,9 @@ def test_the_closed_loop_judges_how_the_recordings_were_read(
     def along_motion(_: object, allowed: Sequence[str]) -> Any:
         return Reading(tuple(allowed), (), (), (), {"name": along if along in allowed else other})
 
+    def stiff(_: object, reading: Any) -> Any:
+        return replace(reading, reasons={"name": other, "link": STIFF})
+
     def in_loop(_: object, reading: Any) -> Any:
         return replace(reading, reasons={"name": other, "encoder": HIDES})
 
@@ -294,7 +297,10 @@ def test_the_closed_loop_judges_how_the_recordings_were_read(
     monkeypatch.setattr(diagnosis, "prepared", lambda *_: None)
     monkeypatch.setattr(diagnosis, "in_the_better_way", lambda _, reading: reading)
     monkeypatch.setattr(diagnosis, "beside_a_link", lambda *_: None)
-    for name, stand_in in (("along_the_motion", along_motion), ("in_the_loop", in_loop), ("_answer", answered)):
+    stand_ins = {
+        "along_the_motion": along_motion, "without_links": stiff, "in_the_loop": in_loop, "_answer": answered,
+    }  # fmt: skip
+    for name, stand_in in stand_ins.items():
         monkeypatch.setattr(diagnosis, name, stand_in)
     answer = diagnose(cast(ExperimentSet, None))
     assert answer.causes[0].effect == first
