@@ -11,7 +11,7 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Builder, Channel, Term, of_each_log, rows_of
 from frictid_hil.gap.command_timing import FASTEST, between_rows
-from frictid_hil.gap.drives import Drive, forms
+from frictid_hil.gap.drive_replay import DriveReplay, forms, with_one
 from frictid_hil.gap.experiment_set import Controller, Nominal, with_gains
 from frictid_hil.gap.gain_errors import gain_errors
 from frictid_hil.gap.plant_channel import BEYOND, families_of, white_nm, without_nuisances
@@ -65,21 +65,21 @@ def actuation_channel(
     logs = [r for r in recordings if r.experiment.torque_nm is not None and r.demand_nm is not None]
     controller = nominal.controller
     limit_nm = math.inf if controller is None else controller.torque_limit_nm
-    drives = [Drive.of(r, nominal) for r in logs]
+    drives = [DriveReplay.of(r, nominal) for r in logs]
     base = [drive.torque(nominal.believed_effects) for drive in drives]
-    shown = _beside([Drive.of(r, nominal) for r in believed], nominal) or [np.zeros(b.size) for b in base]
-    residuals = [left - own for left, own in zip(_beside(drives, nominal), shown, strict=True)]
+    shown = _residuals([DriveReplay.of(r, nominal) for r in believed], nominal) or [np.zeros(b.size) for b in base]
+    residuals = [left - own for left, own in zip(_residuals(drives, nominal), shown, strict=True)]
     # A drive acts on what the controller asks for, and that on the velocity it sees: the one that was read to lag.
     lags = any(form.torque is None and name in seen for name, form in forms().items())
-    shares = gain_errors(nominal, logs, shown, library, as_reported=lags).tolist()
+    shares = gain_errors(nominal, logs, shown, library, lags=lags).tolist()
     views = [_view(r, controller, limit_nm, shares) for r in logs]
     builder = Builder([[] for _ in logs])
     nuisances, candidates = _gains(nominal, views, builder, library)
     nuisances += _timing(nominal, base, logs, builder)
-    # It is late with what wrong gains ask for, too.
+    # And on what wrong gains ask for.
     found = nominal if controller is None else replace(nominal, controller=with_gains(controller, shares))
-    drives = [Drive.of(r, found) for r in logs]
-    asking = [Drive.of(r, found, as_reported=True) for r in logs] if lags else drives
+    drives = [DriveReplay.of(r, found) for r in logs]
+    asking = [DriveReplay.of(r, found, as_reported=True) for r in logs] if lags else drives
     scale = rms(np.concatenate(residuals))
     for name, form in forms().items():
         if name not in library:
@@ -173,8 +173,8 @@ def _shapes(
     name: str,
     form: ActuationForm,
     views: Sequence[DriveView],
-    drives: Sequence[Drive],
-    asking: Sequence[Drive],
+    drives: Sequence[DriveReplay],
+    asking: Sequence[DriveReplay],
     nominal: Nominal,
     seen: Mapping[str, float],
 ) -> list[tuple[dict[str, float], list[Array]]]:
@@ -190,8 +190,7 @@ def _shapes(
             if form.torque is None:
                 base, changed = [drive.torque(believed) for drive in drives], base
             else:
-                held_by = believed.get(name, {}).get(form.parameter, 0.0) if form.late else 0.0
-                effects = {**believed, name: {**values, form.parameter: held_by + float(value)}}
+                effects = with_one(believed, name, form, float(value), detail)
                 changed = [drive.torque(effects) for drive in asking]
             result.append((values, [(c - b)[:, None] for c, b in zip(changed, base, strict=True)]))
     return result
@@ -216,7 +215,7 @@ def _generic(logs: Sequence[Recording], base: Sequence[Array]) -> dict[str, list
     return table
 
 
-def _beside(drives: Sequence[Drive], nominal: Nominal) -> list[Array]:
+def _residuals(drives: Sequence[DriveReplay], nominal: Nominal) -> list[Array]:
     """Reported torque less the believed one, as the drive reports it, N m, shape (n,) per recording."""
     report = nominal.torque_report_filter
     left = []

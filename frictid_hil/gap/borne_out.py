@@ -6,7 +6,7 @@ joint; what brings it no nearer, alone or beside the others, is no cause of the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from frictid_hil.gap.diagnosis import Value
@@ -283,15 +283,28 @@ def _refined(stands: Sequence[Finding], kept: Effects, loop: Loop, gap_nm: float
 
 def _nearest(cause: Finding, kept: Effects, loop: Loop, gap_nm: float) -> tuple[Finding, float]:
     """(A cause with the numbers that bring the simulated joint nearest, the others as they are; its gap)."""
-    values = dict(kept[cause.effect])
-    for name in (*values, *values):
-        tried = {f * values[name]: {**values, name: f * values[name]} for f in FACTORS}
-        gaps = {value: loop.gap_nm({**kept, cause.effect: numbers}) for value, numbers in tried.items()}
-        best = min(gaps, key=lambda value: gaps[value])
-        if gaps[best] < gap_nm:
-            gap_nm, values[name] = gaps[best], best
-    spread = {name: _spread(cause.parameters[name], value) for name, value in values.items()}
-    return replace(cause, parameters=spread), gap_nm
+    before = dict(kept[cause.effect])
+    passes = [(name, FACTORS) for name in (*before, *before)]
+    values, gap_nm = nearest(before, passes, lambda v: loop.gap_nm({**kept, cause.effect: v}), gap_nm)
+    moved = {n: _spread(cause.parameters[n], value) for n, value in values.items() if value != before[n]}
+    return replace(cause, parameters={**cause.parameters, **moved}), gap_nm
+
+
+def nearest(
+    values: Mapping[str, float],  # numbers of one effect
+    passes: Iterable[tuple[str, Sequence[float]]],  # which number to change next, and factors of it to try
+    gap: Callable[[Mapping[str, float]], float],  # that such numbers leave
+    gap_nm: float,  # that these leave
+) -> tuple[dict[str, float], float]:
+    """(Numbers that bring the simulated joint nearest, one after the other; the gap that they leave)."""
+    best = dict(values)
+    for name, factors in passes:
+        tried = {f * best[name]: {**best, name: f * best[name]} for f in factors}
+        gaps = {value: gap(numbers) for value, numbers in tried.items()}
+        value = min(gaps, key=lambda one: gaps[one])
+        if gaps[value] < gap_nm:
+            gap_nm, best[name] = gaps[value], value
+    return best, gap_nm
 
 
 def _spread(told: Value, value: float) -> Value:

@@ -79,8 +79,8 @@ def _others(joint: Prepared, along: Reading, answer: Diagnosis) -> Iterator[Read
     if any(swings(cause.effect) for cause in answer.causes):
         stiff = without_links(joint, along)
         yield in_the_better_way(joint, stiff)
-        if (loose := beside_a_link(joint, stiff, along.allowed)) is not None:
-            yield loose
+        if (link := beside_a_link(joint, stiff, along.allowed)) is not None:
+            yield link
     along_nm, loop_nm = answer.noise_floor.inverse_nm, answer.noise_floor.forward_torque_nm
     coarse = along_nm is not None and loop_nm is not None and loop_nm < COARSE * along_nm
     if coarse and "encoder" not in answer.reasons and (loop := in_the_loop(joint, along)) is not None:
@@ -116,7 +116,7 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
         quiet = quiet_in_the_loop(joint.simulation, reading.found, channels, gaps, nothing_nm)
     still = joint.guessed and _still(joint.simulation, gaps)
     said = verdict(reading.found, channels, gaps, nothing_nm, quiet, joint.simulation is not None, still)
-    if reading.loose:
+    if reading.sought:
         # A link that the closed loop tells is for the closed loop to judge.
         said = Verdict("unknown", tuple(f for f in reading.found if f.chance >= LISTED), said.place)
     if (warning := below_first_pair(said.named, joint.nominal.curve)) is not None:

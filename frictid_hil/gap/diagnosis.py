@@ -20,9 +20,10 @@ class Value:
     low: float | None = None
     high: float | None = None
 
-    def moved(self, more: float) -> Value:
-        """The number and its interval, larger by ``more``."""
-        low, high = (None if end is None else end + more for end in (self.low, self.high))
+    def moved(self, more: float, wider: float) -> Value:
+        """The number larger by ``more``; its interval, too, and wider by ``wider`` on both sides."""
+        low = None if self.low is None else self.low + more - wider
+        high = None if self.high is None else self.high + more + wider
         return Value(self.value + more, low, high)
 
 

@@ -128,14 +128,20 @@ class Replay:
         for e in self._experiments:
             rows = self._rows(model, e, state)
             state = rows.state
-            made.append(replace(e, position_rad=rows.position_rad, torque_nm=rows.torque_nm, velocity_rad_s=None))
+            told = replace(e, position_rad=rows.position_rad, torque_nm=rows.torque_nm)
+            made.append(replace(told, velocity_rad_s=None, torque_demand_nm=None))
         return tuple(made)
 
     def model(self, effects: Effects) -> JointModel:
-        """The nominal joint with effects added (to those it already has)."""
+        """The nominal joint with effects added (to those it already has); a drive is later by their times."""
         merged = {name: dict(values) for name, values in self._nominal.effects.items()}
         for name, values in effects.items():
-            merged[name] = {**merged.get(name, {}), **bounded(name, values)}
+            form = all_effects()[name].actuation
+            late = (
+                {} if form is None or not form.late else {form.parameter: merged.get(name, {}).get(form.parameter, 0.0)}
+            )
+            told = {key: value + late.get(key, 0.0) for key, value in values.items()}
+            merged[name] = {**merged.get(name, {}), **bounded(name, told)}
         return self._nominal.with_effects(merged)
 
     def __call__(
@@ -183,6 +189,8 @@ class Replay:
         for experiment in self._experiments:
             if carried or experiment.name in wanted:
                 result[experiment.name], state = self._one(model, experiment, state)
+            if result.keys() >= set(wanted):
+                break
         return result
 
     def _rows(self, model: JointModel, e: Experiment, state: CarryOver | None) -> Simulated:
@@ -251,10 +259,10 @@ class Simulation:
         """The same of the logs that numbers are read from."""
         return self._gap_nm(effects, self._fitted)
 
-    def loudest_gap_nm(self, count: int) -> Callable[[Effects], float]:
-        """The same of as many of those logs as ``count``, the ones that show most of the gap."""
-        bare = self.replay({}, validation=self._fitted)
-        squares = {name: float(np.sum(run.torque_nm[run.settled :] ** 2)) for name, run in bare.items()}
+    def loudest_gap_nm(self, count: int, beside: Effects) -> Callable[[Effects], float]:
+        """The same of as many of those logs as ``count``, the ones in which most is left ``beside`` some effects."""
+        runs = self.replay(beside, validation=self._fitted)
+        squares = {name: float(np.sum(run.torque_nm[run.settled :] ** 2)) for name, run in runs.items()}
         names = sorted(squares, key=lambda name: -squares[name])[:count]
         return lambda effects: self._gap_nm(effects, self._fitted, names)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.command_timing import PLAUSIBLE, ROUNDS
-from frictid_hil.gap.drives import Drive, forms
+from frictid_hil.gap.drive_replay import DriveReplay, forms, with_one
 from frictid_hil.gap.experiment_set import GAINS, Nominal, with_gains
 from frictid_hil.gap.residuals import LEAST_SHARE, Recording, reported
 from frictid_hil.simulation.drive_form import DriveView
@@ -21,12 +22,12 @@ def gain_errors(
     shown: Sequence[Array],  # of each log's torque, what the believed joint recorded alike shows beside its own demand
     library: Collection[str],  # effects that may be used
     *,
-    as_reported: bool,  # the controller sees the reported velocity
+    lags: bool,  # the reported velocity does, and the controller may act on it
 ) -> Array:
-    """Errors of kp, ki and kd as shares, (3,), as the torques fit best beside a drive that is late by any time.
+    """Errors of kp, ki and kd as shares, (3,), as the torques fit best beside any one effect of the drive.
 
-    A late drive is late with what wrong gains ask for, too: neither is found by itself where both are large. All 0
-    where no law is known.
+    A drive is late with what wrong gains ask for, and a limit cuts it: neither is found by itself where both are large.
+    All 0 where no law is known.
     """
     shares: Array = np.zeros(len(GAINS))
     controller = nominal.controller
@@ -34,32 +35,38 @@ def gain_errors(
         return shares
     pairs = list(zip(logs, shown, strict=True))
     fitted = [(r, own) for r, own in pairs if not r.experiment.validation] or pairs
-    late = [nominal.believed_effects, *_late_drives(nominal, controller.torque_limit_nm, logs, library)]
+    ways = [
+        (effects, seen) for effects in _drives(nominal, logs, library) for seen in ((False, True) if lags else (False,))
+    ]
     for _ in range(ROUNDS):
         steps = np.concatenate([np.zeros((1, len(GAINS))), LEAST_SHARE * np.eye(len(GAINS))])
         near = [replace(nominal, controller=with_gains(controller, (shares + step).tolist())) for step in steps]
-        asked = [([Drive.of(r, one, as_reported=as_reported) for one in near], own) for r, own in fitted]
-        tried = [(*_fitted(asked, effects, nominal), effects) for effects in late]
+        asked = {
+            seen: [([DriveReplay.of(r, one, as_reported=seen) for one in near], own) for r, own in fitted]
+            for seen in {seen for _, seen in ways}
+        }
+        tried = [(*_fitted(asked[seen], effects, nominal), (effects, seen)) for effects, seen in ways]
         numbers, _, best = min(tried, key=lambda one: one[1])
-        shares, late = np.clip(shares + numbers, *PLAUSIBLE), [best]
+        shares, ways = np.clip(shares + numbers, *PLAUSIBLE), [best]
     return shares
 
 
-def _late_drives(
-    nominal: Nominal, limit_nm: float, logs: Sequence[Recording], library: Collection[str]
-) -> list[dict[str, Mapping[str, float]]]:
-    """The believed drive, later by every time worth trying."""
-    believed, late = nominal.believed_effects, []
+def _drives(
+    nominal: Nominal, logs: Sequence[Recording], library: Collection[str]
+) -> list[Mapping[str, Mapping[str, float]]]:
+    """Effects of the believed drive, and those with one more, at every value worth trying."""
+    believed, limit_nm = nominal.believed_effects, DriveReplay.of(logs[0], nominal).limit_nm
     views = [DriveView(r.step_s, limit_nm, r.demand_nm, _torque(r)) for r in logs if r.demand_nm is not None]
+    drives: list[Mapping[str, Mapping[str, float]]] = [believed]
     for name, form in forms().items():
-        if form.late and name in library:
-            held_by = believed.get(name, {}).get(form.parameter, 0.0)
-            late += [{**believed, name: {form.parameter: held_by + float(t)}} for t in form.guesses(views, None)]
-    return late
+        if form.torque is not None and name in library:
+            guesses = itertools.product(form.guesses(views, None), form.details or (0.0,))
+            drives += [with_one(believed, name, form, float(value), detail) for value, detail in guesses]
+    return drives
 
 
 def _fitted(
-    asked: Sequence[tuple[Sequence[Drive], Array]], effects: Mapping[str, Mapping[str, float]], nominal: Nominal
+    asked: Sequence[tuple[Sequence[DriveReplay], Array]], effects: Mapping[str, Mapping[str, float]], nominal: Nominal
 ) -> tuple[Array, float]:
     """(Changes of the gains that bring drives with these effects nearest, the sum of squares that stays).
 

@@ -14,7 +14,7 @@ from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replaye
 from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import EVEN, Finding, Sampled, findings, sampled, told_numbers
-from frictid_hil.gap.forward import Simulation
+from frictid_hil.gap.forward import Effects, Simulation
 from frictid_hil.gap.how_far import Closed, closed
 from frictid_hil.gap.link_in_loop import link_in_loop
 from frictid_hil.gap.loop_channel import loop_channel
@@ -23,14 +23,14 @@ from frictid_hil.gap.posterior import Posterior
 from frictid_hil.gap.prepared import Prepared
 from frictid_hil.gap.residuals import rms
 from frictid_hil.gap.tracking_channel import tracking_channel
-from frictid_hil.gap.verdict import FLOORS, READ_DIRECTLY, swings
+from frictid_hil.gap.verdict import FLOORS, READ_DIRECTLY, REMAINS, swings
 from frictid_hil.simulation.effects import all_effects
 
 COARSE = 0.7
 """Noise of the closed loop over that along the motion, half in power, below which a quiet motion may hide a cause."""
 HIDES = "its steps hide along the motion what the controller answers to: causes are read from the closed loop's torque"
 STIFF = "read without links that swing: so the simulated joint comes nearer to its recording"
-SOUGHT = "sought in closed loop: along the motion causes of a rigid joint stand in for a link that swings"
+SOUGHT = "is sought in closed loop: along the motion causes of a rigid joint stand in for it"
 UNREPORTED = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of what a drive may be later than it reports that are tried
 READ = 0.97  # chance of what is read from reported positions and velocities themselves
 
@@ -46,7 +46,7 @@ class Reading:
     reasons: Mapping[str, str]  # what cannot be told, by name
     along: Sampled | None = None  # the plant channel where the loop channel stands in its place
     # A link that swings, sought in closed loop, and what helps beside it: the first of the causes.
-    loose: Sequence[Finding] = ()
+    sought: Sequence[Finding] = ()
 
     @property
     def measured(self) -> Sequence[Sampled]:
@@ -85,9 +85,15 @@ def _channels(joint: Prepared, allowed: Sequence[str], reasons: dict[str, str]) 
     return [plant] if actuation is None else [plant, actuation]
 
 
-def _read(channels: Sequence[Sampled], joint: Prepared) -> tuple[list[Finding], list[Closed]]:
-    """(causes, gap of each channel without them and with those that are likelier there than not)."""
-    found = _as_late(_with_readings(findings(channels), channels, joint), joint)
+def _read(
+    channels: Sequence[Sampled], joint: Prepared, beside: Sequence[Finding] = ()
+) -> tuple[list[Finding], list[Closed]]:
+    """(causes, gap of each channel without them and with those that are likelier there than not).
+
+    ``beside`` is known to be there and no part of the channels.
+    """
+    found = _with_readings(findings(channels), channels, joint, told_numbers(beside))
+    found = _as_late(found, joint, told_numbers(beside))
     return found, gaps_left(channels, found)
 
 
@@ -108,12 +114,15 @@ def in_the_better_way(joint: Prepared, along: Reading) -> Reading:
 
 def beside_a_link(joint: Prepared, stiff: Reading, allowed: Sequence[str]) -> Reading | None:
     """What the closed loop says beside the link that it tells itself; None where it tells none."""
-    loose = [] if joint.simulation is None else link_in_loop(stiff.found, joint.simulation, allowed)
-    return in_the_loop(joint, stiff, loose) if loose else None
+    if joint.simulation is None or not joint.believed:
+        return None
+    views = [r.view for r in joint.believed if r.view is not None]
+    sought = link_in_loop(stiff.found, joint.simulation, allowed, views)
+    return in_the_loop(joint, stiff, sought) if sought else None
 
 
-def in_the_loop(joint: Prepared, along: Reading, loose: Sequence[Finding] = ()) -> Reading | None:
-    """What the closed loop's torque says, with what shows between demand and torque simulated beside, and ``loose``.
+def in_the_loop(joint: Prepared, along: Reading, sought: Sequence[Finding] = ()) -> Reading | None:
+    """What the closed loop's torque says, with what shows between demand and torque simulated beside, and ``sought``.
 
     None where that runs away, where nothing can be simulated, and where a link swings by itself: that is no small
     change of the loop.
@@ -121,7 +130,7 @@ def in_the_loop(joint: Prepared, along: Reading, loose: Sequence[Finding] = ()) 
     likely = [f for f in along.found if f.chance >= EVEN]
     if joint.simulation is None or not joint.believed or any(swings(f.effect) for f in likely):
         return None
-    beside = told_numbers([*(f for f in likely if f.where == "actuation"), *loose])
+    beside = told_numbers([*(f for f in likely if f.where == "actuation"), *sought])
     steady = [name for name in along.allowed if not swings(name)]
     plant, *others = along.channels
     raw = plant.posterior.channel.raw
@@ -129,14 +138,24 @@ def in_the_loop(joint: Prepared, along: Reading, loose: Sequence[Finding] = ()) 
     if loop is None:
         return None
     channels = [sampled(Posterior(loop, len(along.allowed))), *others]
-    found, gaps = _read(channels, joint)
-    if loose:
-        found = [*loose, *(f for f in found if f.effect not in {one.effect for one in loose})]
-        return Reading(along.allowed, channels, found, gaps, {**along.reasons, "link": SOUGHT}, plant, loose)
+    found, gaps = _read(channels, joint, sought)
+    if sought:
+        found = [*sought, *(f for f in found if f.effect not in {one.effect for one in sought})]
+        return Reading(
+            along.allowed,
+            channels,
+            found,
+            gaps,
+            {**along.reasons, "link": f"{sought[0].effect} {SOUGHT}"},
+            plant,
+            sought,
+        )
     return Reading(along.allowed, channels, found, gaps, {**along.reasons, "encoder": HIDES}, plant)
 
 
-def _with_readings(found: list[Finding], channels: Sequence[Sampled], joint: Prepared) -> list[Finding]:
+def _with_readings(
+    found: list[Finding], channels: Sequence[Sampled], joint: Prepared, beside: Effects
+) -> list[Finding]:
     """The findings with what the kinematic channel reads directly."""
     if not channels or not joint.kinematic:
         return found
@@ -151,35 +170,39 @@ def _with_readings(found: list[Finding], channels: Sequence[Sampled], joint: Pre
         told = {form.parameter: Value(value, 0.95 * value, 1.05 * value)}
         others = [f for f in found if f.effect != name]
         if form.in_loop and joint.simulation is not None:
+            there = {**beside, **told_numbers(f for f in others if f.chance >= EVEN)}
             told[form.in_loop] = Value(
-                _loop_share(name, {form.parameter: value}, form.in_loop, others, joint.simulation)
+                _loop_share(name, {form.parameter: value}, form.in_loop, there, joint.simulation)
             )
         found = [*others, Finding(name, READ, READ, max(size, 1.0), 0.0, told, (), READ_DIRECTLY)]
     return sorted(found, key=lambda f: -f.size)
 
 
-def _loop_share(
-    name: str, values: Mapping[str, float], share: str, others: Sequence[Finding], simulation: Simulation
-) -> float:
+def _loop_share(name: str, values: Mapping[str, float], share: str, beside: Effects, simulation: Simulation) -> float:
     """Whether the controller acts on what is reported, 1 or 0: as the simulated joint comes nearer to its recording."""
-    beside = told_numbers(f for f in others if f.chance >= EVEN)
     gaps_nm = {acts: simulation.fitted_gap_nm({**beside, name: {**values, share: acts}}) for acts in (0.0, 1.0)}
     return min(gaps_nm, key=lambda acts: gaps_nm[acts])
 
 
-def _as_late(found: list[Finding], joint: Prepared) -> list[Finding]:
-    """The findings, a drive as much later than its torque tells as brings the simulated joint nearest."""
-    controller, told = joint.nominal.controller, told_numbers(f for f in found if f.chance >= EVEN)
-    if joint.simulation is None or controller is None:
+def _as_late(found: list[Finding], joint: Prepared, beside: Effects) -> list[Finding]:
+    """The findings, a drive as much later than its torque tells as brings the simulated joint clearly nearer."""
+    controller, simulation = joint.nominal.controller, joint.simulation
+    if simulation is None or controller is None:
         return found
+    there = {**beside, **told_numbers(f for f in found if f.chance >= EVEN)}
     result = []
     for cause in found:
         form = all_effects()[cause.effect].actuation
-        if form is not None and form.unreported_ticks and cause.where == "actuation" and cause.effect in told:
-            name, read_s = form.parameter, told[cause.effect][form.parameter]
-            late_s = [read_s + share * form.unreported_ticks / controller.rate_hz for share in UNREPORTED]
-            nm = {late: joint.simulation.fitted_gap_nm({**told, cause.effect: {name: late}}) for late in late_s}
-            more_s = min(nm, key=lambda late: nm[late]) - read_s
-            cause = replace(cause, parameters={**cause.parameters, name: cause.parameters[name].moved(more_s)})
+        if form is not None and form.unreported_ticks and cause.where == "actuation" and cause.effect in there:
+            name, tick_s = form.parameter, form.unreported_ticks / controller.rate_hz
+            read_s = there[cause.effect][name]
+            squares = {
+                share: simulation.fitted_gap_nm({**there, cause.effect: {name: read_s + share * tick_s}}) ** 2
+                for share in UNREPORTED
+            }
+            more = min(squares, key=lambda share: squares[share])
+            if squares[0.0] - squares[more] > REMAINS**2 * max(squares[0.0] - simulation.noise_nm**2, 0.0):
+                told = cause.parameters[name].moved(more * tick_s, UNREPORTED[1] * tick_s)
+                cause = replace(cause, parameters={**cause.parameters, name: told})
         result.append(cause)
     return result

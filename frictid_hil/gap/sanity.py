@@ -36,13 +36,8 @@ def checked(experiments: ExperimentSet) -> ExperimentSet:
     for e in experiments.experiments:
         _check(e, experiments.nominal)
     signs = [s for e in experiments.experiments if (s := _torque_sign(e)) is not None]
-    # In one direction a bias may be larger than friction.
-    if (
-        signs
-        and not _one_way(experiments)
-        and max(signs) < 0.0
-        and sum(_work_j(e) for e in experiments.experiments) < 0.0
-    ):
+    swapped = bool(signs) and max(signs) < 0.0 and sum(_work_j(e) for e in experiments.experiments) < 0.0
+    if swapped and not _one_way(experiments):  # where a bias may be larger than friction
         raise InputFileError(
             "torque and velocity have opposite signs: the joint seems to drive the motor all the time",
             where=experiments.name,

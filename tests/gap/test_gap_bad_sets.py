@@ -201,7 +201,7 @@ def test_a_joint_that_rings_at_rest_has_no_swapped_sign() -> None:
 
 
 def test_a_bias_larger_than_friction_is_no_swapped_sign_of_a_motor_that_spins_one_way() -> None:
-    """The position's noise goes back a little in most rows."""
+    """The position's noise goes back a little in some rows."""
     random = np.random.default_rng(1)
     time = 0.001 * np.arange(4000)
     position = 5.0 * time + 2e-3 * random.standard_normal(time.size)

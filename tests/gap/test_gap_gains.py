@@ -59,6 +59,16 @@ def test_a_late_drive_is_late_with_what_wrong_gains_ask_for(late: str) -> None:
         assert causes["controller_gain_error"][name].value == pytest.approx(share, abs=0.01)
 
 
+@pytest.mark.slow
+def test_a_torque_that_is_clipped_is_no_error_of_the_gains() -> None:
+    """Fitted without the clip, the gains were 20 % off, and its columns about them told nothing of the closed loop."""
+    found = diagnose(gap_sets.make({"torque_saturation": {"limit_share": 0.3}}))
+    assert [c.effect for c in found.causes] == ["torque_saturation"]
+    assert found.causes[0].parameters["limit_share"].value == pytest.approx(0.3, abs=0.005)
+    before, after = (f.forward_torque_nm for f in (found.before, found.after))
+    assert before is not None and after is not None and after < 0.2 * before
+
+
 def test_the_limit_is_reached() -> None:
     (log, *_) = gap_sets.make({}, replace(gap_sets.NOMINAL, controller=LIMITED), only=("sines_large",)).experiments
     assert log.torque_nm is not None and np.max(np.abs(log.torque_nm)) > 0.98 * LIMITED.torque_limit_nm

@@ -86,6 +86,17 @@ def test_a_delay_that_the_report_tells_in_whole_ticks_is_found_whole() -> None:
 
 
 @pytest.mark.slow
+def test_a_delay_beyond_the_stated_one_is_told_and_simulated_beside_it() -> None:
+    believed = {"torque_delay": {"delay_s": 0.004}}
+    nominal = replace(gap_sets.NOMINAL, believed_effects=believed)
+    found = diagnose(replace(gap_sets.make({"torque_delay": {"delay_s": 0.008}}), nominal=nominal))
+    assert found.verdict == "explained" and found.causes[0].effect == "torque_delay"
+    assert found.causes[0].parameters["delay_s"].value == pytest.approx(0.004, abs=0.0005)
+    before, after = (f.forward_torque_nm for f in (found.before, found.after))
+    assert before is not None and after is not None and after < 0.3 * before
+
+
+@pytest.mark.slow
 def test_a_coarse_encoder_is_not_taken_for_friction() -> None:
     found = diagnose(gap_sets.make({"encoder_quantisation": {"step_rad": 4e-4}}))
     assert [c.effect for c in found.causes][:1] == ["encoder_quantisation"]
@@ -217,5 +228,6 @@ def test_play_whose_phase_is_lost_along_the_motion_is_sought_in_closed_loop(
     assert {c.effect for c in found.causes[: len(effects)]} == set(effects)
     play = next(c for c in found.causes if c.effect == "backlash").parameters["gap_rad"]
     assert play.value == pytest.approx(play_rad, rel=0.15)
+    assert len(effects) > 1 or all(c.confidence < 0.5 for c in found.causes[1:])
     before, after = (f.forward_torque_nm for f in (found.before, found.after))
     assert before is not None and after is not None and after < 0.33 * before

@@ -19,6 +19,17 @@ def forms() -> dict[str, ActuationForm]:
     return dict(sorted(found.items(), key=lambda item: item[1].order))
 
 
+def with_one(
+    believed: Mapping[str, Mapping[str, float]], name: str, form: ActuationForm, value: float, detail: float
+) -> dict[str, Mapping[str, float]]:
+    """The effects of a believed drive and one more; a time is beyond what it is believed to be late by."""
+    held_by = believed.get(name, {}).get(form.parameter, 0.0) if form.late else 0.0
+    values = {form.parameter: held_by + value}
+    if form.detail:
+        values[form.detail] = detail
+    return {**believed, name: values}
+
+
 def through(demand_nm: Array, effects: Mapping[str, Mapping[str, float]], step_s: float, limit_nm: float) -> Array:
     """Torque reported for a demand in force from each sample on: the mean over the step before, shape (n,)."""
     torque = held(demand_nm)
@@ -33,7 +44,7 @@ def through(demand_nm: Array, effects: Mapping[str, Mapping[str, float]], step_s
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class DriveReplay:
     """What a drive is asked for in one recording, at every tick of its controller."""
 
     recording: Recording  # its rows
@@ -42,16 +53,16 @@ class Drive:
     limit_nm: float  # of the torque
 
     @staticmethod
-    def of(recording: Recording, nominal: Nominal, *, as_reported: bool = False) -> Drive:
+    def of(recording: Recording, nominal: Nominal, *, as_reported: bool = False) -> DriveReplay:
         """The drive of one recording; its controller may see the reported velocity instead of the believed one."""
         controller, e = nominal.controller, recording.experiment
         assert recording.demand_nm is not None
         limit_nm = math.inf if controller is None else controller.torque_limit_nm
         if controller is None or e.torque_demand_nm is not None:
-            return Drive(recording, recording.demand_nm, 1, limit_nm)
+            return DriveReplay(recording, recording.demand_nm, 1, limit_nm)
         seen = e.velocity_rad_s if as_reported else None
         demand = demand_of(controller, e, recording.step_s, velocity_rad_s=seen, every_tick=True)
-        return Drive(recording, demand, ticks_of(controller, recording.step_s), limit_nm)
+        return DriveReplay(recording, demand, ticks_of(controller, recording.step_s), limit_nm)
 
     def torque(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
         """Torque that the drive makes with these effects, at every row, N m, shape (n,)."""
