@@ -308,14 +308,24 @@ def _lent(effect: str, channels: Sequence[Sampled]) -> Array:
     return factors
 
 
-def whole_draws(effects: Sequence[str], channels: Sequence[Sampled]) -> tuple[dict[str, dict[str, float]], ...]:
-    """The parameters of some effects in every draw, an effect only where the draw holds it: what belongs together."""
-    lent = {effect: _lent(effect, channels) for effect in effects}
+def whole_draws(
+    told: Mapping[str, Mapping[str, float]], channels: Sequence[Sampled]
+) -> tuple[dict[str, dict[str, float]], ...]:
+    """The parameters of some effects in every draw, an effect only where the draw holds it: what belongs together.
+
+    They lie about what is ``told`` of an effect, which the closed loop may have moved.
+    """
+    lent = {effect: _lent(effect, channels) for effect in told}
+    read = {effect: numbers(effect, channels) for effect in told}
+    moved = {
+        effect: {name: values[name] - read[effect][name].value for name in values if name in read[effect]}
+        for effect, values in told.items()
+    }
     return tuple(
         {
-            effect: {name: float(lent[effect][k]) * value for name, value in told.items()}
-            for effect in effects
-            if (told := _of_draw(effect, channels, k))
+            effect: {n: float(lent[effect][k]) * value + moved[effect].get(n, 0.0) for n, value in values.items()}
+            for effect in told
+            if (values := _of_draw(effect, channels, k))
         }
         for k in range(DRAWS)
     )

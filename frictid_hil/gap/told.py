@@ -57,7 +57,7 @@ def told(
         model=replay.model(effects if applied else {}) if replay is not None else None,
         candidate=replay.model(effects) if replay is not None else None,
         held_out=held_out(plant) if plant is not None else {},
-        samples=whole_draws(list(effects), channels) if effects and channels else (),
+        samples=whole_draws(effects, channels) if effects and channels else (),
         presliding_nm_per_rad=experiments.nominal.presliding_stiffness_nm_per_rad,
         raw=None if plant is None else Raw(*plant.posterior.channel.raw, plant.posterior.channel.cutoff_hz),
     )

@@ -15,7 +15,7 @@ from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.prepared import believed_joint, simulated_joint
-from frictid_hil.gap.residuals import recordings, rms
+from frictid_hil.gap.residuals import demand_of, recordings, rms
 from frictid_hil.gap.tolerances import Tolerances
 from frictid_hil.gap.verdict import DOUBTED
 from frictid_hil.simulation.effects.torque_saturation import HARD, reported
@@ -231,3 +231,14 @@ def test_play_whose_phase_is_lost_along_the_motion_is_sought_in_closed_loop(
     assert len(effects) > 1 or all(c.confidence < 0.5 for c in found.causes[1:])
     before, after = (f.forward_torque_nm for f in (found.before, found.after))
     assert before is not None and after is not None and after < 0.33 * before
+
+
+@pytest.mark.slow
+def test_a_demand_column_beside_a_known_controller_does_not_hide_the_joint() -> None:
+    """The believed joint was recorded with the set's own demand, and all of its gap lay between demand and torque."""
+    made = gap_sets.make({"inertia_error": {"error_share": 0.3}})
+    controller = gap_sets.NOMINAL.controller
+    assert controller is not None
+    told = [replace(e, torque_demand_nm=demand_of(controller, e, e.step_s)) for e in made.experiments]
+    found = diagnose(replace(made, experiments=tuple(told)))
+    assert found.verdict == "explained" and [c.effect for c in found.causes] == ["inertia_error"]

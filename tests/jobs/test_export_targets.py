@@ -42,9 +42,13 @@ def test_words_are_read_and_refused() -> None:
 
 
 @pytest.mark.slow
-def test_samples_spread_as_the_interval_says_and_nothing_is_written_over(arm: ArmSet, tmp_path: Path) -> None:
+@pytest.mark.parametrize("draws", [(), ({"torque_bias": {"bias_nm": 0.1}},)], ids=["no draws", "draws of others"])
+def test_samples_spread_as_the_interval_says_and_nothing_is_written_over(
+    arm: ArmSet, tmp_path: Path, draws: tuple[dict[str, dict[str, float]], ...]
+) -> None:
+    """What was read without a posterior is in no draw, as a link that was sought in closed loop."""
     cause = Cause("friction_level_error", 0.9, {"error_share": Value(0.5, 0.4, 0.6)})
-    found = {"lift": Diagnosis("lift", "explained", (cause,), (), Figures(), Figures(), Figures())}
+    found = {"lift": Diagnosis("lift", "explained", (cause,), (), Figures(), Figures(), Figures(), samples=draws)}
     wanted = Wanted({"samples": tmp_path / "s.json", "c": tmp_path / "f.h"}, samples=200)
     told = write_targets(arm, found, exports(arm, found), wanted, force=False)
     drawn = json.loads((tmp_path / "s.json").read_text())["samples"]

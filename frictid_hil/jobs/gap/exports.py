@@ -310,9 +310,13 @@ def _drawn(
     """The effects of one draw of the posterior: level and slope that belong together, and no effect that it lacks."""
     if not found.samples:
         return {effect: _within_interval(effect, values, found, random) for effect, values in effects.items()}
-    draw = found.samples[int(random.integers(len(found.samples)))]
-    told = {effect: within(effect, draw.get(effect, {})) for effect in effects}
-    return {effect: all_effects()[effect].complete(values) for effect, values in told.items() if values}
+    draw, drawn = found.samples[int(random.integers(len(found.samples)))], set().union(*found.samples)
+    told = {effect: within(effect, draw.get(effect, {})) for effect in effects if effect in drawn}
+    return {
+        **{effect: all_effects()[effect].complete(values) for effect, values in told.items() if values},
+        # What was read without a posterior is in no draw.
+        **{e: _within_interval(e, values, found, random) for e, values in effects.items() if e not in drawn},
+    }
 
 
 def _within_interval(
