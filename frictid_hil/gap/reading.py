@@ -124,8 +124,8 @@ def beside_a_link(joint: Prepared, stiff: Reading, allowed: Sequence[str]) -> Re
 def in_the_loop(joint: Prepared, along: Reading, sought: Sequence[Finding] = ()) -> Reading | None:
     """What the closed loop's torque says, with what shows between demand and torque simulated beside, and ``sought``.
 
-    None where that runs away, where nothing can be simulated, and where a link swings by itself: that is no small
-    change of the loop.
+    None where that runs away, where nothing can be simulated, and where a link is likely to swing that nobody has sought
+    in closed loop: a column of it is no small change of the loop.
     """
     likely = [f for f in along.found if f.chance >= EVEN]
     if joint.simulation is None or not joint.believed or any(swings(f.effect) for f in likely):
@@ -141,15 +141,8 @@ def in_the_loop(joint: Prepared, along: Reading, sought: Sequence[Finding] = ())
     found, gaps = _read(channels, joint, sought)
     if sought:
         found = [*sought, *(f for f in found if f.effect not in {one.effect for one in sought})]
-        return Reading(
-            along.allowed,
-            channels,
-            found,
-            gaps,
-            {**along.reasons, "link": f"{sought[0].effect} {SOUGHT}"},
-            plant,
-            sought,
-        )
+        reasons = {**along.reasons, "link": f"{sought[0].effect} {SOUGHT}"}
+        return Reading(along.allowed, channels, found, gaps, reasons, plant, sought)
     return Reading(along.allowed, channels, found, gaps, {**along.reasons, "encoder": HIDES}, plant)
 
 
