@@ -124,8 +124,8 @@ def beside_a_link(joint: Prepared, stiff: Reading, allowed: Sequence[str]) -> Re
 def in_the_loop(joint: Prepared, along: Reading, sought: Sequence[Finding] = ()) -> Reading | None:
     """What the closed loop's torque says, with what shows between demand and torque simulated beside, and ``sought``.
 
-    None where that runs away, where nothing can be simulated, and where a link is likely to swing that nobody has sought
-    in closed loop: a column of it is no small change of the loop.
+    None where that runs away, where nothing can be simulated, and where a link is likely to swing: its column is no
+    small change of the loop. One that is ``sought`` is simulated.
     """
     likely = [f for f in along.found if f.chance >= EVEN]
     if joint.simulation is None or not joint.believed or any(swings(f.effect) for f in likely):
