@@ -88,11 +88,10 @@ def verdict(
     doubtful = all(f.chance < EVEN for f in named)  # no reason to call a gap within noise anything but none
     if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):
         return Verdict("none", ())
-    new = any(gap.appeared is not None and stays(gap, REMAINS) for gap in gaps)
     # Where functions without a name describe it as well, the names tell the gap only if they close it, and not at all
     # where those functions make more of it.
     untold = _unnamed([c for c, _ in telling if c in loud]) and any(stays(gap, REMAINS) for _, gap in telling)
-    if nothing or generic_wins or untold or new or any(_open(gap, negligible) for _, gap in telling):
+    if nothing or generic_wins or untold or any(_open(gap, negligible) for _, gap in telling):
         # A link that swings may be no help along the motion, and close the loop all the same.
         return Verdict("unknown", named or tuple(f for f in found if f.chance >= LISTED and swings(f.effect)), place)
     if (varies := next((f for f in named if f.chance >= EVEN and _varies(f, channels)), None)) is not None:
