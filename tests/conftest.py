@@ -46,6 +46,8 @@ SAMPLED = {  # function: the parameters that the whole check takes; ``--long`` t
     "test_every_effect_is_named": {
         *("encoder_offset", "joint_elasticity", "load_dependent_friction", "stribeck", "torque_delay", "torque_ripple"),
     },
+    "test_play_whose_phase_is_lost_along_the_motion_is_sought_in_closed_loop": {"alone"},
+    "test_a_late_drive_is_late_with_what_wrong_gains_ask_for": {"electrical_lag"},
     "test_no_gap_is_reported_that_is_larger_than_the_logs_contain": {"healthy", "joint_elasticity"},
     "test_traces_that_are_real_but_drown_in_noise_are_no_cause": {"1"},
     "test_nine_of_ten_knots_are_covered_and_the_intervals_are_not_useless": {

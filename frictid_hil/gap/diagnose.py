@@ -112,10 +112,11 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     channels, gaps, reasons = reading.channels, reading.gaps, dict(reading.reasons)
     nothing_nm = negligible_nm(joint.nominal, channels, negligible)
     quiet = quiet_before_any_filter(reading.measured, negligible)
+    small = quiet and (joint.simulation is None or pooled(joint.simulation.bare, "torque_nm") <= nothing_nm)
     if quiet and joint.simulation is not None:
         quiet = quiet_in_the_loop(joint.simulation, reading.found, channels, gaps, nothing_nm)
     still = joint.guessed and _still(joint.simulation, gaps)
-    said = verdict(reading.found, channels, gaps, nothing_nm, quiet, joint.simulation is not None, still)
+    said = verdict(reading.found, channels, gaps, nothing_nm, quiet, joint.simulation is not None, still, small)
     if reading.sought:
         # A link that the closed loop tells is for the closed loop to judge.
         said = Verdict("unknown", tuple(f for f in reading.found if f.chance >= LISTED), said.place)

@@ -58,6 +58,7 @@ def verdict(
     otherwise_quiet: bool,  # the residual before any filter and the simulated closed loop show no more than noise
     loop_judges: bool = False,  # the closed loop can be simulated
     loop_still: bool = False,  # it shows no gap as large as its noise, and what the controller asks for is a guess
+    small: bool = False,  # before any filter and in closed loop the gap means nothing to the user
 ) -> Verdict:
     """Decide."""
     unreached = [f for f in found if needed(f, channels) and _unreached(f, channels)]
@@ -91,7 +92,10 @@ def verdict(
     # Where functions without a name describe it as well, the names tell the gap only if they close it, and not at all
     # where those functions make more of it.
     untold = _unnamed([c for c, _ in telling if c in loud]) and any(stays(gap, REMAINS) for _, gap in telling)
-    if nothing or generic_wins or untold or any(_open(gap, negligible) for _, gap in telling):
+    unexplained = nothing or generic_wins or untold or any(_open(gap, negligible) for _, gap in telling)
+    if unexplained and small and _nothing_beyond_tolerance(channels) and all(gap.before <= negligible for gap in gaps):
+        return Verdict("none", ())
+    if unexplained:
         # A link that swings may be no help along the motion, and close the loop all the same.
         return Verdict("unknown", named or tuple(f for f in found if f.chance >= LISTED and swings(f.effect)), place)
     if (varies := next((f for f in named if f.chance >= EVEN and _varies(f, channels)), None)) is not None:
@@ -104,6 +108,11 @@ def verdict(
     if first.leads < LEADS and rivals:
         return Verdict("ambiguous", named)
     return Verdict("explained", named)
+
+
+def _nothing_beyond_tolerance(channels: Sequence[Sampled]) -> bool:
+    """Whether hardly a draw needs a cause, or a function without a name, beside the errors that beliefs may have."""
+    return all(float(np.mean([not draw.model.effects for draw in c.draws])) >= CERTAIN for c in channels)
 
 
 def _shown(
