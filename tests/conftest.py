@@ -96,6 +96,7 @@ LONG = {  # functions that ``--long`` alone runs: what they show is shown by oth
     "test_the_loop_is_timed_beside_stock_canopen_and_beside_an_empty_one",
     "test_the_table_does_what_a_can_run_with_the_same_delay_does_within_three_points",
     "test_an_error_of_the_belief_that_makes_four_floors_in_the_loop_is_named_small_as_it_is_along_the_motion",
+    "test_play_is_found_behind_a_coarse_encoder",
     "test_what_was_left_out_is_told_with_its_reason",
     "test_friction_is_found_over_it",
     "test_on_the_wall_clock_it_reaches_the_same",

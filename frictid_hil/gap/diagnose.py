@@ -112,7 +112,7 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     channels, gaps, reasons = reading.channels, reading.gaps, dict(reading.reasons)
     nothing_nm = negligible_nm(joint.nominal, channels, negligible)
     quiet = quiet_before_any_filter(reading.measured, negligible)
-    small = quiet and (joint.simulation is None or pooled(joint.simulation.bare, "torque_nm") <= nothing_nm)
+    small = quiet and (joint.simulation is None or pooled(joint.simulation.bare, "torque_nm") <= HALF * nothing_nm)
     if quiet and joint.simulation is not None:
         quiet = quiet_in_the_loop(joint.simulation, reading.found, channels, gaps, nothing_nm)
     still = joint.guessed and _still(joint.simulation, gaps)

@@ -58,7 +58,7 @@ def verdict(
     otherwise_quiet: bool,  # the residual before any filter and the simulated closed loop show no more than noise
     loop_judges: bool = False,  # the closed loop can be simulated
     loop_still: bool = False,  # it shows no gap as large as its noise, and what the controller asks for is a guess
-    small: bool = False,  # before any filter and in closed loop the gap means nothing to the user
+    small: bool = False,  # before any filter, and to half of what is negligible in closed loop, there is no gap
 ) -> Verdict:
     """Decide."""
     unreached = [f for f in found if needed(f, channels) and _unreached(f, channels)]
@@ -93,7 +93,8 @@ def verdict(
     # where those functions make more of it.
     untold = _unnamed([c for c, _ in telling if c in loud]) and any(stays(gap, REMAINS) for _, gap in telling)
     unexplained = nothing or generic_wins or untold or any(_open(gap, negligible) for _, gap in telling)
-    if unexplained and small and _nothing_beyond_tolerance(channels) and all(gap.before <= negligible for gap in gaps):
+    small = small and all(gap.before <= HALF * negligible for gap in gaps)
+    if unexplained and small and _nothing_beyond_tolerance(channels):
         return Verdict("none", ())
     if unexplained:
         # A link that swings may be no help along the motion, and close the loop all the same.

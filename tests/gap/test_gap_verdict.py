@@ -122,3 +122,19 @@ def test_an_error_is_listed_where_the_draws_agree_on_its_sign(above: float) -> N
 def test_what_is_no_error_of_the_belief_has_no_sides() -> None:
     signs = np.where(np.arange(DRAWS) % 2, 1.0, -1.0)
     assert [f.effect for f in findings([channel("plant", CAUSE, 3.0, signs)])] == [CAUSE]
+
+
+@pytest.mark.parametrize(
+    ("before", "needs", "small", "word"),
+    [(4.0, 0.0, True, "none"), (6.0, 0.0, True, "unknown"), (4.0, 0.1, True, "unknown"), (4.0, 0.0, False, "unknown")],
+)
+def test_a_small_gap_that_tolerances_make_is_none_where_hardly_a_draw_needs_a_cause(
+    before: float, needs: float, small: bool, word: str
+) -> None:
+    """A healthy joint of another friction law, 1 % of the friction off, was `unknown`."""
+    drawn = channel("plant", ERROR, 0.1, np.ones(DRAWS))
+    models = [frozenset(["family time"] if k < needs * DRAWS else []) for k in range(DRAWS)]
+    draws: Any = [SimpleNamespace(model=SimpleNamespace(effects=m), values=np.zeros(1)) for m in models]
+    drawn = replace(drawn, draws=draws)
+    gap = Closed("plant", before, 1.0, 0.9, 1.1, floor=1.0)
+    assert verdict([], [drawn], [gap], 10.0, otherwise_quiet=False, small=small).word == word
