@@ -31,7 +31,7 @@ settings.register_profile(
 )  # the developer's loop; the whole check draws as many as tests say
 
 SAMPLED = {  # function: the parameters that the whole check takes; ``--long`` takes them all
-    "test_calibrated_behind_anothers_canopen": {"copley", "zeroerr"},
+    "test_calibrated_behind_anothers_canopen": {"copley"},
     "test_tshark_finds_no_malformed_frame": {"copley", "zeroerr"},
     "test_a_unit_is_found_and_its_interval_covers_it": {
         *("0-copley", "6-nanotec", "10-damiao", "13-cybergear", "16-feetech-scs", "17-dynamixel"),
@@ -44,7 +44,7 @@ SAMPLED = {  # function: the parameters that the whole check takes; ``--long`` t
     },
     "test_a_healthy_servo_of_two_speeds_is_within_its_interval": {"feetech calibrate"},
     "test_every_effect_is_named": {
-        *("encoder_offset", "joint_elasticity", "load_dependent_friction", "stribeck", "torque_delay", "torque_ripple"),
+        *("joint_elasticity", "stribeck", "torque_delay", "torque_ripple"),
     },
     "test_play_whose_phase_is_lost_along_the_motion_is_sought_in_closed_loop": {"alone"},
     "test_a_late_drive_is_late_with_what_wrong_gains_ask_for": {"electrical_lag"},
@@ -96,7 +96,10 @@ LONG = {  # functions that ``--long`` alone runs: what they show is shown by oth
     "test_the_loop_is_timed_beside_stock_canopen_and_beside_an_empty_one",
     "test_the_table_does_what_a_can_run_with_the_same_delay_does_within_three_points",
     "test_an_error_of_the_belief_that_makes_four_floors_in_the_loop_is_named_small_as_it_is_along_the_motion",
+    "test_calibrated_behind_anothers_canopen_and_a_gateway_on_tcp",
+    "test_a_lag_of_the_drive_is_told_behind_a_velocity_that_lags_by_another_filter",
     "test_play_is_found_behind_a_coarse_encoder",
+    "test_the_arm_is_late_whichever_motions_are_judged",
     "test_what_was_left_out_is_told_with_its_reason",
     "test_friction_is_found_over_it",
     "test_on_the_wall_clock_it_reaches_the_same",
