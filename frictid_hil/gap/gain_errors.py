@@ -35,9 +35,7 @@ def gain_errors(
         return shares
     pairs = list(zip(logs, shown, strict=True))
     fitted = [(r, own) for r, own in pairs if not r.experiment.validation] or pairs
-    ways = [
-        (effects, seen) for effects in _drives(nominal, logs, library) for seen in ((False, True) if lags else (False,))
-    ]
+    ways = list(itertools.product(_drives(nominal, logs, library), (False, True) if lags else (False,)))
     for _ in range(ROUNDS):
         steps = np.concatenate([np.zeros((1, len(GAINS))), LEAST_SHARE * np.eye(len(GAINS))])
         near = [replace(nominal, controller=with_gains(controller, (shares + step).tolist())) for step in steps]

@@ -38,7 +38,7 @@ def link_in_loop(
     likely, noise_nm = [f for f in found if f.chance >= EVEN], simulation.noise_nm
     beside = told_numbers(helping(likely, simulation.fitted_gap_nm, noise_nm))
     gap = simulation.loudest_gap_nm(LOGS, beside)
-    left_nm = gap(beside)
+    left_nm = without_nm = gap(beside)
     fair = REMAINS**2 * max(left_nm**2 - noise_nm**2, noise_nm**2)
     best: dict[str, dict[str, float]] = {}
     for name in sorted((n for n in allowed if swings(n)), key=lambda n: len(all_effects()[n].parameters)):
@@ -51,8 +51,8 @@ def link_in_loop(
     rest = helping(likely, lambda one: simulation.fitted_gap_nm({**best, **one}), noise_nm)
     ((name, values),) = best.items()
     told = {key: Value(value, value / SPREAD, value * SPREAD) for key, value in values.items()}
-    (made_nm,) = simulation.made_nm([best])
-    return [Finding(name, DOUBTED, DOUBTED, made_nm / noise_nm, 1.0, told, (), "loop"), *rest]
+    size = math.sqrt(without_nm**2 - left_nm**2) / max(noise_nm, 1e-9 * without_nm)
+    return [Finding(name, DOUBTED, DOUBTED, size, 1.0, told, (), "loop"), *rest]
 
 
 def _sought(name: str, gap: Gap, left_nm: float, views: Sequence[View]) -> tuple[dict[str, float], float]:

@@ -31,11 +31,9 @@ def off(value: float, true: float) -> float:
     return min(1.0, abs(math.log10(max(value, 1e-12) / true)))
 
 
-def simulation(gap_nm: Any) -> Simulation:
+def simulation(gap_nm: Any, noise_nm: float = 0.05) -> Simulation:
     """A stand-in whose closed loop leaves what a function of the effects says, on all logs."""
-    told = SimpleNamespace(
-        fitted_gap_nm=gap_nm, loudest_gap_nm=lambda _, __: gap_nm, noise_nm=0.05, made_nm=lambda each: [1.0] * len(each)
-    )
+    told = SimpleNamespace(fitted_gap_nm=gap_nm, loudest_gap_nm=lambda _, __: gap_nm, noise_nm=noise_nm)
     return cast(Simulation, told)
 
 
@@ -49,10 +47,11 @@ def gap_of_play(effects: Effects) -> float:
     return 0.05 + misses + drift + (0.3 if "gravity_error" in effects else 0.0)
 
 
-def test_play_is_found_of_any_size_and_what_stood_in_for_it_is_told_no_more() -> None:
+@pytest.mark.parametrize("noise_nm", [0.05, 0.0])
+def test_play_is_found_of_any_size_and_what_stood_in_for_it_is_told_no_more(noise_nm: float) -> None:
     found = [cause("gravity_error", error_share=0.2), cause("temperature_drift", coulomb_share=0.3)]
-    play, *rest = link_in_loop(found, simulation(gap_of_play), LINKS, ())
-    assert play.effect == "backlash" and play.confidence == DOUBTED
+    play, *rest = link_in_loop(found, simulation(gap_of_play, noise_nm), LINKS, ())
+    assert play.effect == "backlash" and play.confidence == DOUBTED and math.isfinite(play.size)
     assert play.parameters["gap_rad"].value == pytest.approx(PLAY_RAD, rel=0.15)
     assert play.parameters["contact_stiffness_nm_per_rad"].value == pytest.approx(STIFFNESS, rel=0.5)
     assert [f.effect for f in rest] == ["temperature_drift"]
