@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import html
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 from importlib.resources import files
 from pathlib import Path
@@ -235,10 +237,19 @@ def printed(page: Path, to: Path) -> None:
 
 
 def _headless(address: str, place: Path, *what: str) -> None:
+    """A browser that does one thing and ends; one that hangs, as browsers do at times, is begun anew."""
     assert CHROMIUM is not None
-    command = [
-        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars",
-        "--disable-sync", "--disable-background-networking", "--disable-component-update",
-        f"--user-data-dir={place / 'browser'}", "--virtual-time-budget=8000", *what, address,
-    ]  # fmt: skip
-    subprocess.run(command, capture_output=True, timeout=300, check=True)
+    for attempt in range(2):
+        command = [
+            CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars",
+            "--disable-sync", "--disable-background-networking", "--disable-component-update",
+            f"--user-data-dir={place / f'browser-{attempt}'}", "--virtual-time-budget=8000", *what, address,
+        ]  # fmt: skip
+        silent = subprocess.DEVNULL
+        with subprocess.Popen(command, stdout=silent, stderr=silent, start_new_session=True) as browser:
+            try:
+                assert browser.wait(100.0) == 0
+                return
+            except subprocess.TimeoutExpired:
+                os.killpg(browser.pid, signal.SIGKILL)
+    raise TimeoutError("the browser hung twice")
