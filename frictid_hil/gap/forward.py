@@ -136,12 +136,10 @@ class Replay:
         """The nominal joint with effects added (to those it already has); a drive is later by their times."""
         merged = {name: dict(values) for name, values in self._nominal.effects.items()}
         for name, values in effects.items():
-            form = all_effects()[name].actuation
-            late = (
-                {} if form is None or not form.late else {form.parameter: merged.get(name, {}).get(form.parameter, 0.0)}
-            )
-            told = {key: value + late.get(key, 0.0) for key, value in values.items()}
-            merged[name] = {**merged.get(name, {}), **bounded(name, told)}
+            form, there = all_effects()[name].actuation, merged.get(name, {})
+            if form is not None and form.late and form.parameter in values:
+                values = {**values, form.parameter: values[form.parameter] + there.get(form.parameter, 0.0)}
+            merged[name] = {**there, **bounded(name, values)}
         return self._nominal.with_effects(merged)
 
     def __call__(
