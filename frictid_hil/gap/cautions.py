@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.fft import next_fast_len, rfft
 
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
@@ -14,6 +15,7 @@ from frictid_hil.gap.findings import Finding
 from frictid_hil.gap.residuals import LowPass, uniform
 from frictid_hil.gap.sanity import LEAST_ROWS
 
+ENOUGH_HZ = 100.0  # rate of rows that show any motion of a joint
 ONE_SINUSOID = (
     "one sinusoid only: what follows travel (presliding hysteresis) and what follows time (a delay) look alike on it"
 )
@@ -61,14 +63,17 @@ def one_sinusoid(experiments: ExperimentSet) -> bool:
 
 def _sinusoid(q: Array, time_s: Array) -> tuple[float, float] | None:
     """(frequency in Hz, amplitude in rad) where one sinusoid leaves less than 3 % of the squares; else None."""
-    spectrum = np.abs(np.fft.rfft(q * np.hanning(q.size), 8 * q.size))
-    coarse = float(np.argmax(spectrum)) / (8 * q.size * float(time_s[1] - time_s[0]))
+    step_s = float(time_s[1] - time_s[0])
+    thin = max(1, int(1.0 / (ENOUGH_HZ * step_s)))
+    q, time_s, step_s = q[::thin], time_s[::thin], thin * step_s
+    points = next_fast_len(8 * q.size, real=True)
+    coarse = float(np.argmax(np.abs(rfft(q * np.hanning(q.size), points)))) / (points * step_s)
     best: tuple[float, float, float] | None = None
     for hertz in coarse * np.linspace(0.9, 1.1, 41):
         angle = 2.0 * math.pi * hertz * time_s
-        columns = np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle)], axis=1)
-        weights, *_ = np.linalg.lstsq(columns, q, rcond=None)
-        left = float(np.mean((q - columns @ weights) ** 2))
+        columns = np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle)])
+        weights = np.linalg.lstsq(columns @ columns.T, columns @ q, rcond=None)[0]
+        left = float(np.mean((q - weights @ columns) ** 2))
         if best is None or left < best[0]:
             best = left, float(hertz), float(np.hypot(weights[0], weights[1]))
     if best is None or best[0] > 0.03 * float(np.mean(q**2)):

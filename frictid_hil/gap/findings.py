@@ -69,6 +69,8 @@ class Sampled:
     generic: Array  # the same of all generic functions together
     explained: Array  # the same of all causes together
     gram: Array  # mean products of the channel's columns over all its rows, shape (m, m)
+    # By cause, its parameters in every draw, once they were asked for.
+    read: dict[str, list[dict[str, float]]] = field(default_factory=dict)
 
 
 def sampled(posterior: Posterior) -> Sampled:
@@ -288,8 +290,8 @@ def _rivals(row: int, names: Sequence[str], there: np.ndarray, shown: Array) -> 
 def numbers(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
     """The effect's parameters over all draws that hold it, its interval with what forms may have put on them."""
     told: dict[str, list[tuple[float, float]]] = {}
-    for k, lent in enumerate(_lent(effect, channels)):
-        for name, value in _of_draw(effect, channels, k).items():
+    for lent, values in zip(_lent(effect, channels), _of_draws(effect, channels), strict=True):
+        for name, value in values.items():
             told.setdefault(name, []).append((value, lent * value))
     result = {}
     for name, pairs in told.items():
@@ -321,22 +323,27 @@ def whole_draws(
         effect: {name: values[name] - read[effect][name].value for name in values if name in read[effect]}
         for effect, values in told.items()
     }
+    drawn = {effect: _of_draws(effect, channels) for effect in told}
     return tuple(
         {
             effect: {n: float(lent[effect][k]) * value + moved[effect].get(n, 0.0) for n, value in values.items()}
             for effect in told
-            if (values := _of_draw(effect, channels, k))
+            if (values := drawn[effect][k])
         }
         for k in range(DRAWS)
     )
 
 
-def _of_draw(effect: str, channels: Sequence[Sampled], k: int) -> dict[str, float]:
-    told: dict[str, float] = {}
+def _of_draws(effect: str, channels: Sequence[Sampled]) -> list[dict[str, float]]:
+    """The parameters of an effect in every draw, what each channel tells of one added up; empty where it is not in."""
+    result: list[dict[str, float]] = [{} for _ in range(DRAWS)]
     for channel in channels:
-        for name, value in parameters(effect, channel, k).items():
-            told[name] = told.get(name, 0.0) + value
-    return told
+        if effect not in channel.read:
+            channel.read[effect] = [parameters(effect, channel, k) for k in range(DRAWS)]
+        for told, read in zip(result, channel.read[effect], strict=True):
+            for name, value in read.items():
+                told[name] = told.get(name, 0.0) + value
+    return result
 
 
 def parameters(effect: str, channel: Sampled, k: int) -> dict[str, float]:

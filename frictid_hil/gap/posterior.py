@@ -22,6 +22,7 @@ from scipy import special
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap import noise
 from frictid_hil.gap.channel import FAMILY, Channel, Term
+from frictid_hil.gap.gaussian import each_alone, integrated, log_between, put_inside, together
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -42,7 +43,6 @@ VISIBLE = 0.5
 """Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
 MOST_DOUBT = 3.0
 """Variance that forms may lend to what tells causes apart, at most: more of it shows in the noise itself."""
-ROUNDING = 1e-12  # share of a matrix' largest entry that rounding may leave in the others
 SURE = 5.0
 """Mean of a coefficient over its one-sigma, from which on its term is a whole model of its cause; a lag between two
 shapes may be shared by them."""
@@ -180,7 +180,7 @@ class Posterior:
                 scaled = gram.copy()
                 scaled[:nuisances] *= care
                 scaled[:, :nuisances] *= care
-                final, more = _integrated(scaled, np.arange(nuisances), np.arange(nuisances, terms + 1))
+                final, more = integrated(scaled, np.arange(nuisances), np.arange(nuisances, terms + 1))
                 base.append(log_density + more)
                 grams.append(final[:-1, :-1])
                 rights.append(final[:-1, -1])
@@ -194,25 +194,25 @@ class Posterior:
     # -- scores ---------------------------------------------------------------------------------------------------
 
     def _prepare_blocks(self) -> None:
-        """Candidates by number of columns, so that all of one size are scored at once."""
+        """What is believed of each candidate, and where its columns stand."""
         candidates = self.channel.candidates
-        shapes = Counter(term.effect for term in candidates)
-        self._log_prior = np.array([self._log_chance - math.log(shapes[term.effect]) for term in candidates])
-        self._local = [own - self._first for own in self._own[len(self.channel.nuisances) :]]
-        self._blocks = {
-            size: np.array([t for t, own in enumerate(self._local) if own.size == size])
-            for size in {own.size for own in self._local}
+        self._shapes = {
+            e: [t for t, own in enumerate(candidates) if own.effect == e] for e in {c.effect for c in candidates}
         }
+        self._log_prior = np.array([self._log_chance - math.log(len(self._shapes[t.effect])) for t in candidates])
+        self._local = [own - self._first for own in self._own[len(self.channel.nuisances) :]]
+        self._starts = np.array([own[0] for own in self._local], dtype=int)
+        self._sizes = np.array([own.size for own in self._local], dtype=int)
         safe = np.where(self._scale > 0.0, self._scale, np.inf)
         self._centre = (self._mean / safe)[self._first :]
-        first = [own[0] for own in self._local]
         self._whole = np.array([abs(float(t.mean[0])) > SURE * float(t.deviation[0]) for t in candidates], dtype=bool)
         bounds = np.array([[t.least, t.largest] for t in candidates])
         finite = np.isfinite(bounds)
-        scaled = np.where(finite, bounds, 0.0) / safe[self._first :][first][:, None]
+        scaled = np.where(finite, bounds, 0.0) / safe[self._first :][self._starts][:, None]
         self._low, self._high = np.where(finite, scaled, bounds).T
-        middle = self._centre[first]
-        self._before = _log_between(self._low - middle, self._high - middle)
+        middle = self._centre[self._starts]
+        self._before = log_between(self._low - middle, self._high - middle)
+        self._bounded = np.any(finite, axis=1)
 
     def model(self, terms: Sequence[int]) -> Model:
         """The score of a set of candidates."""
@@ -228,54 +228,40 @@ class Posterior:
     def _gains(self, terms: tuple[int, ...]) -> Array:
         """What a set adds to the log chance at every point of the grid, its prior included, shape (g,)."""
         at = np.concatenate([self._local[t] for t in terms])
-        inner = self._grams[:, at[:, None], at] + np.eye(at.size)
-        centre = self._expected(terms)
-        right = self._rights[:, at] + centre
-        covariance = np.linalg.inv(inner)
-        mean = np.einsum("gij,gj->gi", covariance, right)
+        firsts = np.cumsum([0, *(self._local[t].size for t in terms[:-1])])
+        bounded = [k for k, t in enumerate(terms) if self._bounded[t]]
+        own = np.array(terms)[bounded]
+        gains, mean, variance = together(self._grams, self._rights, self._expected(terms), at, firsts[bounded])
+        spread = np.sqrt(variance)
+        held = log_between((self._low[own] - mean) / spread, (self._high[own] - mean) / spread)
         again = len(terms) - len({self.channel.candidates[t].effect for t in terms})
-        constant = float(np.sum(self._log_prior[list(terms)])) - again * self._log_chance - 0.5 * float(centre @ centre)
-        gains: Array = 0.5 * np.sum(right * mean, axis=1) - 0.5 * np.linalg.slogdet(inner)[1] + constant
-        start = 0
-        for t in terms:
-            if math.isfinite(self._low[t]) or math.isfinite(self._high[t]):
-                spread = np.sqrt(covariance[:, start, start])
-                low, high = (self._low[t] - mean[:, start]) / spread, (self._high[t] - mean[:, start]) / spread
-                gains = gains + _log_between(low, high) - self._before[t]
-            start += self._local[t].size
-        return gains
+        constant = float(np.sum(self._log_prior[list(terms)]) - np.sum(self._before[own])) - again * self._log_chance
+        added: Array = gains + np.sum(held, axis=1) + constant
+        return added
 
     def _extended(self, terms: Sequence[int], g: int) -> Array:
         """What each candidate would add to a set at one point of the grid, shape (candidates,)."""
         gram, right = self._grams[g], self._rights[g]
+        at, solved = np.zeros(0, dtype=int), np.zeros((0, right.size))
         if terms:
             at = np.concatenate([self._local[t] for t in terms])
             solved = np.linalg.solve(gram[np.ix_(at, at)] + np.eye(at.size), gram[at])
             right = right - solved.T @ (right[at] + self._expected(terms))
-            gram = gram - gram[:, at] @ solved
-        gains = np.full(len(self._local), -np.inf)
-        held = [self.channel.candidates[t].effect for t in terms]
-        for size, block in self._blocks.items():
-            columns = np.array([self._local[t] for t in block])
-            inner = gram[columns[:, :, None], columns[:, None, :]] + np.eye(size)
-            again = np.array([self.channel.candidates[t].effect in held for t in block])
-            centre = np.where((again & self._whole[block])[:, None], 0.0, self._centre[columns])
-            target = right[columns] + centre
-            covariance = np.linalg.inv(inner)
-            mean = np.einsum("bij,bj->bi", covariance, target)
-            found = 0.5 * np.einsum("bi,bi->b", mean, target) - 0.5 * np.sum(centre**2, axis=1)
-            found -= 0.5 * np.linalg.slogdet(inner)[1]
-            spread = np.sqrt(np.maximum(covariance[:, 0, 0], 1e-300))
-            low, high = (self._low[block] - mean[:, 0]) / spread, (self._high[block] - mean[:, 0]) / spread
-            bounded = np.isfinite(self._low[block]) | np.isfinite(self._high[block])
-            found += np.where(bounded, _log_between(low, high) - self._before[block], 0.0)
-            gains[block] = found + self._log_prior[block]
-        counts = Counter(held)
-        for t, candidate in enumerate(self.channel.candidates):
-            if counts[candidate.effect]:
+        held = Counter(self.channel.candidates[t].effect for t in terms)
+        centre = self._centre.copy()
+        for t in (t for effect in held for t in self._shapes[effect] if self._whole[t]):
+            centre[self._local[t]] = 0.0
+        gains, mean, variance = each_alone(gram, right, centre, self._starts, self._sizes, at, solved)
+        own = self._bounded
+        spread = np.sqrt(variance[own])
+        low, high = (self._low[own] - mean[own]) / spread, (self._high[own] - mean[own]) / spread
+        gains[own] += log_between(low, high) - self._before[own]
+        gains += self._log_prior
+        for effect, count in held.items():
+            for t in self._shapes[effect]:
                 # Two shapes of one cause make one between them; a third adds nothing.
-                between = counts[candidate.effect] == 1 and bool(candidate.shape) and t not in terms
-                between = between and not candidate.effect.startswith(FAMILY)
+                between = count == 1 and bool(self.channel.candidates[t].shape) and t not in terms
+                between = between and not effect.startswith(FAMILY)
                 gains[t] = gains[t] - self._log_chance if between else -np.inf
         return gains
 
@@ -405,7 +391,7 @@ class Posterior:
             values = mean + root @ random.standard_normal(mean.size)
             if np.all((values[starts] >= low) & (values[starts] <= high)):
                 return values
-        return _put_inside(values, root, starts, low, high)
+        return put_inside(values, root, starts, low, high)
 
     def _coefficients(self, model: Model, g: int) -> tuple[np.ndarray, Array, Array]:
         """(columns, mean, square root of the covariance) of scaled coefficients at one point of the grid."""
@@ -524,45 +510,3 @@ def by_term(terms: Sequence[Term], values: Array) -> list[tuple[Term, Array]]:
 def joined(parts: Sequence[tuple[np.ndarray, Array]]) -> tuple[np.ndarray, Array]:
     """(columns, coefficients) of several parts one after the other."""
     return np.concatenate([c for c, _ in parts]), np.concatenate([v for _, v in parts])
-
-
-def _put_inside(values: Array, root: Array, starts: np.ndarray, low: Array, high: Array) -> Array:
-    """Values put on the bounds that they lie beyond; what is like them follows as their covariance has it."""
-    for _ in starts:
-        beyond = np.maximum(low - values[starts], 0.0) - np.maximum(values[starts] - high, 0.0)
-        worst = int(np.argmax(np.abs(beyond)))
-        if beyond[worst] == 0.0:
-            break
-        row = root[starts[worst]]
-        values = values + root @ row * (beyond[worst] / float(row @ row))
-    values[starts] = np.clip(values[starts], low, high)
-    return values
-
-
-def _log_between(low: Array, high: Array) -> Array:
-    """Logarithm of a standard normal's chance between two bounds, however far in its tail they lie."""
-    swap = low > 0.0
-    low, high = np.where(swap, -high, low), np.where(swap, -low, high)
-    top, rest = special.log_ndtr(high), special.log_ndtr(low)
-    difference: Array = top + np.log1p(-np.exp(np.minimum(rest - top, -1e-12)))
-    return difference
-
-
-def _integrated(gram: Array, inside: np.ndarray, outside: np.ndarray) -> tuple[Array, float]:
-    """(Gram matrix of ``outside`` with the ``inside`` columns integrated out, what that adds to the log chance).
-
-    The last of ``outside`` is the residual itself; the inside coefficients have zero mean and unit variance.
-    """
-    left = gram[np.ix_(outside, outside)].copy()
-    if inside.size == 0:
-        return left, 0.0
-    known = gram[np.ix_(inside, inside)] + np.eye(inside.size)
-    try:
-        lower = np.linalg.cholesky(known)
-    except np.linalg.LinAlgError:
-        # Columns that are alike and very well known leave rounding below zero.
-        lower = np.linalg.cholesky(known + ROUNDING * float(np.max(np.diag(known))) * np.eye(inside.size))
-    solved = np.linalg.solve(lower, gram[np.ix_(inside, outside)])
-    left -= solved.T @ solved
-    gain = 0.5 * float(solved[:, -1] @ solved[:, -1])
-    return left, gain - float(np.sum(np.log(np.diag(lower))))

@@ -109,11 +109,12 @@ def steady(
 
 def gravity_torque(parameters: Vector, position_rad: float) -> float:
     """Torque that holds the link and its payload at rest."""
-    gravity_nm = parameters[GRAVITY_COS] * math.cos(position_rad) + parameters[GRAVITY_SIN] * math.sin(position_rad)
+    cos = math.cos(position_rad)
+    gravity_nm = parameters[GRAVITY_COS] * cos + parameters[GRAVITY_SIN] * math.sin(position_rad)
     # What the links beyond this one ask of it in an arm; a lone joint has none.
     gravity_nm += parameters[ARM_TORQUE]
     # effects at gravity transform gravity_nm
-    gravity_nm += parameters[PAYLOAD_GRAVITY_COS] * math.cos(position_rad)
+    gravity_nm += parameters[PAYLOAD_GRAVITY_COS] * cos
     return float(gravity_nm)
 
 

@@ -64,6 +64,7 @@ def closed_loop(
     payload: bool = False,  # it is mounted
     seed: int | None = None,  # of the noise on the reported torque, then rounded as the drive does; None for neither
     state: CarryOver | None = None,  # warmth left by the recording before; None for a cold joint
+    substep_s: float | None = None,  # longest sub-step of the physics; ``SUBSTEP_S`` where None
 ) -> Simulated:
     """The joint under a controller that follows the recorded commands."""
     time = np.asarray(time_s, dtype=np.float64)
@@ -92,7 +93,7 @@ def closed_loop(
     parameters[plant.CASCADE] = float(controller.cascade)
     parameters[plant.CONTROL_FILTER_S] = controller.velocity_filter_s
     parameters[plant.TORQUE_LIMIT] = min(controller.torque_limit_nm, model.drive.torque_limit_nm)
-    rows = _simulate(parameters, commands, period_s, plant.POSITION_MODE, float(command[0]), state, time)
+    rows = _simulate(parameters, commands, period_s, plant.POSITION_MODE, float(command[0]), state, time, substep_s)
     return rows if seed is None else _noisy(rows, model, seed)
 
 
@@ -128,6 +129,7 @@ def _simulate(
     start_rad: float,
     carried: CarryOver | None,
     time: Array,
+    substep_s: float | None = None,
 ) -> Simulated:
     vector = packing.state()
     functions = kernel()
@@ -138,7 +140,7 @@ def _simulate(
         if carried is not None and name in carried:
             vector[slot] = carried[name]
     first_rad = vector[plant.MEASURED]
-    substeps = max(1, math.ceil(period_s / SUBSTEP_S - 1e-6))
+    substeps = max(1, math.ceil(period_s / (substep_s or SUBSTEP_S) - 1e-6))
     readings = np.empty((len(commands), plant.READINGS))
     functions.run(parameters, vector, commands, readings, mode, substeps, period_s / substeps)
 

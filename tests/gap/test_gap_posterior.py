@@ -27,9 +27,10 @@ from frictid_hil.gap.findings import (
     parameters,
     sampled,
 )
+from frictid_hil.gap.gaussian import integrated, put_inside
 from frictid_hil.gap.plainest import plainest
 from frictid_hil.gap.plant_channel import plant_channel
-from frictid_hil.gap.posterior import VISIBLE, Draw, Posterior, _integrated, _put_inside, by_term
+from frictid_hil.gap.posterior import VISIBLE, Draw, Posterior, by_term
 from frictid_hil.gap.residuals import recordings
 from frictid_hil.gap.tolerances import Sigma
 from frictid_hil.simulation.effects import all_effects
@@ -66,7 +67,7 @@ def test_a_belief_far_beyond_its_tolerance_is_wrong_and_no_other_form_of_frictio
 
 def test_what_may_not_be_drawn_is_made_up_for_by_what_is_like_it() -> None:
     root = np.linalg.cholesky(np.array([[1.0, -0.9, 0.0], [-0.9, 1.0, 0.0], [0.0, 0.0, 1.0]]))
-    told = _put_inside(np.array([-3.0, 3.0, 0.5]), root, np.array([0, 2]), np.array([-1.0, -np.inf]), np.full(2, 9.0))
+    told = put_inside(np.array([-3.0, 3.0, 0.5]), root, np.array([0, 2]), np.array([-1.0, -np.inf]), np.full(2, 9.0))
     # The two are nearly one cause with opposite signs: the second gives back what the first may not make.
     np.testing.assert_allclose(told, [-1.0, 3.0 - 0.9 * 2.0, 0.5])
 
@@ -175,7 +176,7 @@ def test_columns_that_are_alike_and_very_well_known_are_integrated_out() -> None
     wide = 1e9 * random.standard_normal((400, 5))
     alike = wide[:, :3] + 1e-4 * random.standard_normal((400, 3))
     table = np.concatenate([wide, alike, random.standard_normal((400, 2))], axis=1)
-    left, gain = _integrated(table.T @ table, np.arange(8), np.array([8, 9]))
+    left, gain = integrated(table.T @ table, np.arange(8), np.array([8, 9]))
     assert np.isfinite(gain) and np.all(np.diag(left) > 0.0)
 
 

@@ -88,9 +88,11 @@ def lines_seen(views: Sequence[View]) -> tuple[float, ...]:
     thin = max(1, angle.size // MOST_ROWS)
     angle, rest, step = angle[::thin], rest[::thin], step[::thin]
     power = np.empty(orders.size)
+    once, turned = np.exp(-1j * angle), np.exp(-1j * orders[0] * angle)
     for k, order in enumerate(orders):
         known = order * step < np.pi
-        power[k] = abs(np.mean(rest[known] * np.exp(-1j * order * angle[known]))) ** 2 * np.sqrt(known.mean())
+        power[k] = abs((rest * known) @ turned / known.sum()) ** 2 * np.sqrt(known.mean())
+        turned *= once
     near = [power[max(0, k - NEIGHBOURS) : k + NEIGHBOURS + 1] for k in range(orders.size)]
     ratio = power / np.maximum([np.median(part) for part in near], 1e-300)
     best = [k for k in np.argsort(-power) if ratio[k] > STANDS_OUT][: len(PREFIXES)]
