@@ -259,11 +259,14 @@ def _taken_off(values: Effects, loop: Loop) -> tuple[list[str], float]:
     gap_nm = loop.gap_nm(values)
     while len(kept) > 1:
         without = {name: loop.gap_nm({n: values[n] for n in kept if n != name}) for name in kept}
-        best = min(without, key=lambda name: without[name])
-        if without[best] >= gap_nm:
+        harmful = sorted((n for n in kept if without[n] < gap_nm), key=lambda name: without[name])
+        if not harmful:
             break
-        kept.remove(best)
-        gap_nm = without[best]
+        for name in harmful:
+            # One that does harm beside all may help once a worse one is gone.
+            others = {n: values[n] for n in kept if n != name}
+            if others and (left_nm := loop.gap_nm(others)) < gap_nm:
+                kept, gap_nm = list(others), left_nm
     return kept, gap_nm
 
 

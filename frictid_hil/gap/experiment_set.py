@@ -109,7 +109,7 @@ class Nominal:
     document: Mapping[str, Any] | None = None  # the whole file, for writing an improved one
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Experiment:
     """One recording with its part in the diagnosis; columns have shape (n,), absent ones are None."""
 

@@ -85,29 +85,28 @@ def sampled(posterior: Posterior) -> Sampled:
     expected = 1.0 / math.sqrt(_ways(posterior, gram))
     sided = {term.effect for term in posterior.channel.nuisances if len(term.columns) == 1}
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
-
-    def size_of(parts: Sequence[tuple[np.ndarray, Array]]) -> float:
-        if not parts:
-            return 0.0
-        columns, values = joined(parts)
-        square = float(values @ gram[np.ix_(columns, columns)] @ values)
-        return math.sqrt(max(0.0, square)) / posterior.floor
-
+    squares = np.diag(gram)
+    before: dict[tuple[tuple[int, ...], int], dict[str, tuple[float, float]]] = {}
     for k, draw in enumerate(draws):
         parts = posterior.contributions(draw)
         causes = {name: part for name, part in parts.items() if name and not name.startswith(FAMILY)}
         # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
         named = {**causes, **({"": parts[""]} if "" in parts else {})}
-        told = _net(list(named.values()), np.array([form_of(name) for name in named]), gram)
+        inner = _products(list(named.values()), gram)
+        told = _net(inner, np.array([form_of(name) for name in named]))
         for effect, net, blur in zip(causes, *told, strict=False):
             sizes[effect][k] = net / posterior.floor
             signs[effect][k] = np.sign(np.sum(causes[effect][1])) if effect in sided else 1.0
             blurs[effect][k] = blur / posterior.floor
-        for effect, (within, whole) in posterior.believed(draw, np.diag(gram)).items():
+        key = draw.model.terms, draw.setting
+        if key not in before:
+            before[key] = posterior.believed(draw, squares)
+        for effect, (within, whole) in before[key].items():
             tolerated[effect][k] = math.sqrt(within) / posterior.floor
             believed[effect][k] = math.sqrt(whole) / posterior.floor
-        explained[k] = size_of(list(causes.values()))
-        generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
+        explained[k] = _size(inner[: len(causes), : len(causes)]) / posterior.floor
+        families = [part for name, part in parts.items() if name.startswith(FAMILY)]
+        generic[k] = _size(_products(families, gram)) / posterior.floor
     lent = {effect: expected * blur for effect, blur in blurs.items()}
     return Sampled(posterior, draws, held, sizes, signs, blurs, lent, believed, tolerated, generic, explained, gram)
 
@@ -132,18 +131,33 @@ def _ways(posterior: Posterior, gram: Array) -> float:
     return max(1.0, columns.size**2 / max(float(np.sum(correlations**2)), 1.0))
 
 
-def _net(parts: Sequence[tuple[np.ndarray, Array]], forms: Array, gram: Array) -> tuple[Array, Array]:
+def _products(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> Array:
+    """Mean products of what several parts (columns, coefficients) make, shape (p, p)."""
+    if not parts:
+        return np.zeros((0, 0))
+    columns, values = joined(parts)
+    starts = np.cumsum([0, *(own.size for _, own in parts[:-1])])
+    each = values[:, None] * gram[np.ix_(columns, columns)] * values
+    products: Array = np.add.reduceat(np.add.reduceat(each, starts, axis=0), starts, axis=1)
+    return products
+
+
+def _size(inner: Array) -> float:
+    """RMS of what parts with these mean products make together."""
+    return math.sqrt(max(0.0, float(np.sum(inner))))
+
+
+def _net(inner: Array, forms: Array) -> tuple[Array, Array]:
     """(RMS of what each cause makes less what others take back, one-sigma of what their forms may have put on it).
 
-    ``forms`` is how far each may be off its form, over its size.
+    ``inner`` holds the mean products of what the causes make; ``forms`` is how far each may be off its form, over its
+    size.
 
     A pair that more than half cancels explains nothing. A cause that moves as a larger one does is told from it by
     their forms alone, and no joint is quite as its formula.
     """
-    if not parts:
+    if not inner.size:
         return np.zeros(0), np.zeros(0)
-    vectors = np.stack([np.bincount(columns, values, gram.shape[0]) for columns, values in parts])
-    inner = vectors @ gram @ vectors.T
     squares = np.maximum(np.diag(inner), 1e-300)
     own = np.sqrt(squares)
     pair = squares[:, None] + squares + 2.0 * inner

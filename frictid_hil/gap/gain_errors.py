@@ -77,7 +77,8 @@ def _fitted(
         columns = np.stack([*((m - made[0]) / LEAST_SHARE for m in made[1:]), _torque(r) - made[0] - own], axis=1)
         tables.append(columns - np.mean(columns, axis=0))
     table = np.concatenate(tables)
-    numbers: Array = np.linalg.lstsq(table[:, :-1], table[:, -1], rcond=None)[0]
+    gram = table.T @ table
+    numbers: Array = np.linalg.lstsq(gram[:-1, :-1], gram[:-1, -1], rcond=None)[0]
     return numbers, float(np.sum((table[:, -1] - table[:, :-1] @ numbers) ** 2))
 
 

@@ -17,7 +17,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap import noise
@@ -222,7 +221,7 @@ class Posterior:
             if terms:
                 by_setting = by_setting + self._gains(terms)
             effects = frozenset(self.channel.candidates[t].effect for t in terms)
-            self._known[terms] = Model(terms, effects, float(special.logsumexp(by_setting)), by_setting)
+            self._known[terms] = Model(terms, effects, float(np.logaddexp.reduce(by_setting)), by_setting)
         return self._known[terms]
 
     def _gains(self, terms: tuple[int, ...]) -> Array:
@@ -269,7 +268,8 @@ class Posterior:
         """Candidates worth adding, the best first: the best shape of each cause, at the points that matter."""
         points = np.argsort(-model.by_setting)[:POINTS]
         weight = model.by_setting[points]
-        total = special.logsumexp(np.array([self._extended(model.terms, g) for g in points]) + weight[:, None], axis=0)
+        added = np.array([self._extended(model.terms, g) for g in points])
+        total = np.logaddexp.reduce(added + weight[:, None], axis=0)
         best: dict[str, int] = {}
         for t in np.argsort(-total):
             if total[t] < model.score - WORTH:

@@ -207,6 +207,7 @@ def _recording(nominal: Nominal, raw: Experiment, start_s: float, late: float | 
     return Recording(experiment, step_s, resampled, view, plant, demand, actuation, kinematic)
 
 
+@functools.lru_cache(maxsize=32)
 def uniform(experiment: Experiment) -> tuple[Experiment, float, bool]:
     """The experiment on a clock of equal steps; (it, step in s, whether it had to be resampled)."""
     steps = np.diff(experiment.time_s)
@@ -271,8 +272,6 @@ def view_of(
         link_inertia_kg_m2=inertia - motor,
         payload_inertia_kg_m2=payload.inertia_kg_m2,
         gear_ratio=nominal.gear_ratio or 1.0,
-        gravity_cos_nm=nominal.gravity_cos_nm + payload_cos,
-        gravity_sin_nm=nominal.gravity_sin_nm,
         gradual_rad=coulomb / stiffness if nominal.yields_gradually else 0.0,
     )
 

@@ -42,8 +42,6 @@ class View:
     link_inertia_kg_m2: float  # link side without payload
     payload_inertia_kg_m2: float  # 0 where none is mounted
     gear_ratio: float  # motor turns per joint turn; 1 where unknown
-    gravity_cos_nm: float  # of joint and payload: gravity is ``cos*cos(q) + sin*sin(q)``
-    gravity_sin_nm: float
     gradual_rad: float = 0.0  # travel over which friction follows a changing level where it builds up gradually; else 0
 
     @property
@@ -131,10 +129,9 @@ def behind_transmission(v: View, gap_rad: float, stiffness_nm_per_rad: float, re
     from frictid_hil.simulation.inverse_loops import transmitted
 
     link, damping = v.link_inertia_kg_m2 + v.payload_inertia_kg_m2, relaxation_s * stiffness_nm_per_rad
-    torque = transmitted(
-        v.position_rad, v.step_s, link, v.gravity_cos_nm, v.gravity_sin_nm, gap_rad, stiffness_nm_per_rad, damping
-    )
-    rigid = link * v.acceleration_rad_s2 + v.gravity_nm + v.payload_gravity_nm
+    gravity, slope = v.gravity_nm + v.payload_gravity_nm, v.gravity_slope_nm_per_rad
+    torque = transmitted(v.position_rad, v.step_s, link, gravity, slope, gap_rad, stiffness_nm_per_rad, damping)
+    rigid = link * v.acceleration_rad_s2 + gravity
     return np.asarray(torque - rigid)[:, None]
 
 

@@ -41,6 +41,9 @@ def soft_spring(position_rad: Array, distance_rad: float, loop_exponent: float, 
     loop = 0.0
     for k in range(1, position_rad.shape[0]):
         travel = position_rad[k] - position_rad[k - 1]
+        if loop * travel > 0.0 and abs(loop) > 1.0 - 1e-9:
+            state[k] = loop  # it slides on
+            continue
         parts = int(abs(travel) / distance_rad * 4.0) + 1
         turn = travel / distance_rad / parts
         for _ in range(parts):
@@ -107,13 +110,15 @@ def transmitted(
     position_rad: Array,
     step_s: float,
     link_kg_m2: float,
-    gravity_cos_nm: float,
-    gravity_sin_nm: float,
+    gravity_nm: Array,
+    gravity_slope_nm_per_rad: Array,
     gap_rad: float,
     stiffness_nm_per_rad: float,
     damping_nm_s_per_rad: float,
 ) -> Array:
     """Torque from motor to link through play and spring, the link moved by the measured motor, N m, shape (n,).
+
+    Gravity and its slope by position are those of a link that stands where the motor does.
 
     Nothing is transmitted to a link without inertia.
     """
@@ -125,14 +130,12 @@ def transmitted(
     part_s = step_s / parts
     half = 0.5 * gap_rad
     damped = 1.0 / (1.0 + part_s / link_kg_m2 * damping_nm_s_per_rad)
-    load = gravity_cos_nm * math.cos(position_rad[0]) + gravity_sin_nm * math.sin(position_rad[0])
+    load = gravity_nm[0]
     link = position_rad[0] - load / stiffness_nm_per_rad - math.copysign(half, load)
     speed = 0.0
     for k in range(rows - 1):
         motor_speed = (position_rad[k + 1] - position_rad[k]) / step_s
-        cos, sin = math.cos(position_rad[k]), math.sin(position_rad[k])
-        here = gravity_cos_nm * cos + gravity_sin_nm * sin
-        slope = gravity_sin_nm * cos - gravity_cos_nm * sin
+        here, slope = gravity_nm[k], gravity_slope_nm_per_rad[k]
         total = 0.0
         for part in range(parts):
             motor = position_rad[k] + motor_speed * part_s * (part + 0.5)

@@ -95,7 +95,7 @@ def _spinning(torque_nm: np.ndarray, position_rad: np.ndarray, step_s: float, ge
         acceleration_rad_s2=np.gradient(velocity, step_s), torque_nm=torque_nm, slip=np.sign(velocity), rate_nm=zero,
         gravity_nm=zero, payload_gravity_nm=zero, gravity_slope_nm_per_rad=zero, load_nm=zero, coulomb_nm=1.0,
         stiffness_nm_per_rad=1e4, motor_inertia_kg_m2=0.0, link_inertia_kg_m2=0.2, payload_inertia_kg_m2=0.0,
-        gear_ratio=gear_ratio, gravity_cos_nm=0.0, gravity_sin_nm=0.0,
+        gear_ratio=gear_ratio,
     )  # fmt: skip
 
 
