@@ -33,6 +33,7 @@ from frictid_hil.gap import (
     borne_out,
     command_timing,
     findings,
+    forward,
     generic,
     how_far,
     kinematics,
@@ -67,6 +68,7 @@ LATE: tuple[tuple[ModuleType, str], ...] = (
     (verdict, "LISTED"), (verdict, "NEEDED"), (verdict, "CERTAIN"), (verdict, "EVEN"), (verdict, "LEADS"),
     (verdict, "FORMS_OFF"),
     (borne_out, "BOUNCED"), (borne_out, "REFUTED"), (borne_out, "FAR"), (link_in_loop, "LOGS"),
+    (link_in_loop, "SPREAD"),
     (how_far, "COLOUR"), (how_far, "APPEARED"), (how_far, "WINDOW_S"),
     (quiet, "NEGLIGIBLE"), (quiet, "LOUD"), (diagnosis, "UNDECIDED"),
 )  # fmt: skip
@@ -87,6 +89,8 @@ TABLES: tuple[tuple[ModuleType, str], ...] = (
     (command_timing, "HALVED"), (command_timing, "ALIKE"),
 )  # fmt: skip
 """The tables of the channels."""
+SIMULATED: tuple[tuple[ModuleType, str], ...] = ((forward, "RIGID_SUBSTEP_S"),)
+"""The joint under its controller."""
 CHANCES = (
     "SIDED", "DOUBTED", "NEEDED", "CERTAIN", "LEADS", "EVEN", "UNTOLD", "REFUTED", "UNDECIDED", "LISTED", "CLEARLY",
 )  # fmt: skip
@@ -102,7 +106,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--tables", type=int, default=10, help="joints on which constants of the tables are varied")
     parser.add_argument("--jobs", type=int, default=1)
-    known = [_named(*one) for one in (*LATE, *SEARCHED, *TABLES)]
+    known = [_named(*one) for one in (*LATE, *SEARCHED, *TABLES, *SIMULATED)]
     parser.add_argument("--only", nargs="+", choices=known, default=known, metavar="CONSTANT", help="vary these alone")
     parser.add_argument("--write-docs", action="store_true")
     arguments = parser.parse_args()
@@ -163,11 +167,13 @@ def all_answers(case: Path, tables: bool, only: frozenset[str]) -> dict[str, Ans
             with changed(module, name, factor):
                 answers[what] = _answer(experiments)
 
+    answers["as it is"] = _answer(experiments)
+    if tables:
+        vary(SIMULATED)
     with ExitStack() as held:
         held.enter_context(put(prepared, "fit_kinematics", once(kinematics.fit_kinematics)))
         held.enter_context(put(prepared, "believed_joint", once(prepared.believed_joint, as_recorded)))
         held.enter_context(put(prepared, "Replay", once(Replay, as_recorded)))
-        answers["as it is"] = _answer(experiments)
         if tables:
             vary(TABLES)
         for name in ("plant_channel", "actuation_channel", "tracking_channel"):
