@@ -46,6 +46,8 @@ def plant_channel(
     believed: Sequence[Recording] = (),
     # The same with its encoder's steps: what they make of the rows is noise where it is louder than the position's own.
     stepped: Sequence[Recording] = (),
+    *,
+    lines: bool = True,  # lines over position may widen the band
 ) -> Channel | None:
     """The channel of a set; None where no log has a torque."""
     logs = [r for r in recordings if r.view is not None and r.plant_nm is not None]
@@ -64,7 +66,7 @@ def plant_channel(
     friction_nm = rms(np.concatenate([v.coulomb_nm * v.slip + v.rate_nm for v in views]))
     scale = min(friction_nm / 3.0, _gap_nm(residuals, logs[0].step_s))
     builder, known, candidates = terms_of(nominal, views, measured, logs, library, estimated, scale)
-    low_pass = band(residuals, logs[0].step_s, candidates, builder.parts)
+    low_pass = band(residuals, logs[0].step_s, candidates if lines else (), builder.parts)
     rows = []
     for r, v, residual, noise, columns in zip(logs, measured, residuals, noises, builder.parts, strict=True):
         held = first_slide(v.position_rad, 3.0 * v.coulomb_nm / v.stiffness_nm_per_rad)
@@ -213,7 +215,7 @@ def band(
     """
     rate = 1.0 / step_s
     usable = [hertz for hertz in BANDS_HZ if hertz <= 0.2 * rate] or [0.2 * rate]
-    lines = [t for t in candidates if not t.effect.startswith(FAMILY) and _is_line(t.effect)]
+    lines = [t for t in candidates if not t.effect.startswith(FAMILY) and is_line(t.effect)]
     if len(usable) == 1 or not lines:
         return LowPass(rate, usable[0])
     tables = [[_taken(part, t.columns) for part in parts] for t in lines]
@@ -221,7 +223,7 @@ def band(
     return LowPass(rate, next((h for h in usable if not worth or h > worth[-1]), usable[-1]))
 
 
-def _is_line(effect: str) -> bool:
+def is_line(effect: str) -> bool:
     """Whether an effect looks for lines over position in the recordings themselves."""
     form = all_effects()[effect].inverse
     return (

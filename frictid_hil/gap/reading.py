@@ -18,10 +18,10 @@ from frictid_hil.gap.forward import Effects, Simulation
 from frictid_hil.gap.how_far import Closed, closed
 from frictid_hil.gap.link_in_loop import link_in_loop
 from frictid_hil.gap.loop_channel import loop_channel
-from frictid_hil.gap.plant_channel import plant_channel
+from frictid_hil.gap.plant_channel import is_line, plant_channel
 from frictid_hil.gap.posterior import Posterior
 from frictid_hil.gap.prepared import Prepared
-from frictid_hil.gap.residuals import rms
+from frictid_hil.gap.residuals import CUTOFF_HZ, rms
 from frictid_hil.gap.tracking_channel import tracking_channel
 from frictid_hil.gap.verdict import FLOORS, READ_DIRECTLY, REMAINS, swings
 from frictid_hil.simulation.effects import all_effects
@@ -55,20 +55,38 @@ class Reading:
 
 
 def along_the_motion(joint: Prepared, allowed: Sequence[str]) -> Reading:
-    """What the recordings say along the measured motion."""
+    """What the recordings say along the measured motion, in a band that is wider than usual only where a line is there.
+
+    Noise of a wide band may hide what moves slowly.
+    """
     reasons = dict(joint.reasons)
     channels = [sampled(Posterior(c, len(allowed))) for c in _channels(joint, allowed, reasons)]
-    return Reading(allowed, channels, *_read(channels, joint), reasons)
+    reading = Reading(allowed, channels, *_read(channels, joint), reasons)
+    if _widened(channels) and not any(is_line(f.effect) for f in reading.found if f.chance >= EVEN):
+        reading = _read_again(joint, reading, allowed, reasons, lines=False)
+    return reading
 
 
 def without_links(joint: Prepared, along: Reading) -> Reading:
     """The same without causes that let a link swing; they show nowhere but in the joint itself."""
     allowed = [name for name in along.allowed if not swings(name)]
     reasons = {**along.reasons, "link": STIFF}
-    plant = plant_channel(joint.nominal, joint.logs, allowed, reasons, joint.believed, joint.stepped)
+    return _read_again(joint, along, allowed, reasons, lines=_widened(along.channels))
+
+
+def _read_again(
+    joint: Prepared, along: Reading, allowed: Sequence[str], reasons: dict[str, str], *, lines: bool
+) -> Reading:
+    """A reading with another plant channel in the place of its own."""
+    plant = plant_channel(joint.nominal, joint.logs, allowed, reasons, joint.believed, joint.stepped, lines=lines)
     assert plant is not None
     channels = [sampled(Posterior(plant, len(allowed))), *along.channels[1:]]
     return Reading(allowed, channels, *_read(channels, joint), reasons)
+
+
+def _widened(channels: Sequence[Sampled]) -> bool:
+    """Whether lines over position have widened the band of the plant."""
+    return any(c.posterior.channel.name == "plant" and c.posterior.channel.cutoff_hz > CUTOFF_HZ for c in channels)
 
 
 def _channels(joint: Prepared, allowed: Sequence[str], reasons: dict[str, str]) -> list[Channel]:
