@@ -289,7 +289,7 @@ def _nearest(cause: Finding, kept: Effects, loop: Loop, gap_nm: float) -> tuple[
     before = dict(kept[cause.effect])
     passes = [(name, FACTORS) for name in (*before, *before)]
     values, gap_nm = nearest(before, passes, lambda v: loop.gap_nm({**kept, cause.effect: v}), gap_nm)
-    moved = {n: _spread(cause.parameters[n], value) for n, value in values.items() if value != before[n]}
+    moved = {n: spread_about(cause.parameters[n], value) for n, value in values.items() if value != before[n]}
     return replace(cause, parameters={**cause.parameters, **moved}), gap_nm
 
 
@@ -310,7 +310,7 @@ def nearest(
     return best, gap_nm
 
 
-def _spread(told: Value, value: float) -> Value:
+def spread_about(told: Value, value: float) -> Value:
     """A number found in closed loop, its interval as wide as the change and as the one it had."""
     assert told.low is not None and told.high is not None
     half = max(abs(value - told.value), 0.5 * (told.high - told.low))

@@ -5,14 +5,15 @@ Along the measured motion, from the torque of the closed loop, or from that besi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replayed
 from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.diagnosis import Value
+from frictid_hil.gap.drive_in_loop import as_late
 from frictid_hil.gap.findings import EVEN, Finding, Sampled, findings, sampled, told_numbers
 from frictid_hil.gap.forward import Effects, Simulation
 from frictid_hil.gap.how_far import Closed, closed
@@ -23,7 +24,7 @@ from frictid_hil.gap.posterior import Posterior
 from frictid_hil.gap.prepared import Prepared
 from frictid_hil.gap.residuals import CUTOFF_HZ, rms
 from frictid_hil.gap.tracking_channel import tracking_channel
-from frictid_hil.gap.verdict import FLOORS, READ_DIRECTLY, REMAINS, swings
+from frictid_hil.gap.verdict import FLOORS, READ_DIRECTLY, swings
 from frictid_hil.simulation.effects import all_effects
 
 COARSE = 0.7
@@ -31,7 +32,6 @@ COARSE = 0.7
 HIDES = "its steps hide along the motion what the controller answers to: causes are read from the closed loop's torque"
 STIFF = "read without links that swing: so the simulated joint comes nearer to its recording"
 SOUGHT = "is sought in closed loop: along the motion causes of a rigid joint stand in for it"
-UNREPORTED = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of what a drive may be later than it reports that are tried
 READ = 0.97  # chance of what is read from reported positions and velocities themselves
 
 
@@ -61,7 +61,7 @@ def along_the_motion(joint: Prepared, allowed: Sequence[str]) -> Reading:
     """
     reasons = dict(joint.reasons)
     channels = [sampled(Posterior(c, len(allowed))) for c in _channels(joint, allowed, reasons)]
-    reading = Reading(allowed, channels, *_read(channels, joint), reasons)
+    reading = Reading(allowed, channels, *_read(channels, joint, allowed), reasons)
     if _widened(channels) and not any(is_line(f.effect) for f in reading.found if f.chance >= EVEN):
         reading = _read_again(joint, reading, allowed, reasons, lines=False)
     return reading
@@ -81,7 +81,7 @@ def _read_again(
     plant = plant_channel(joint.nominal, joint.logs, allowed, reasons, joint.believed, joint.stepped, lines=lines)
     assert plant is not None
     channels = [sampled(Posterior(plant, len(allowed))), *along.channels[1:]]
-    return Reading(allowed, channels, *_read(channels, joint), reasons)
+    return Reading(allowed, channels, *_read(channels, joint, allowed), reasons)
 
 
 def _widened(channels: Sequence[Sampled]) -> bool:
@@ -104,14 +104,17 @@ def _channels(joint: Prepared, allowed: Sequence[str], reasons: dict[str, str]) 
 
 
 def _read(
-    channels: Sequence[Sampled], joint: Prepared, beside: Sequence[Finding] = ()
+    channels: Sequence[Sampled], joint: Prepared, allowed: Collection[str], beside: Sequence[Finding] = ()
 ) -> tuple[list[Finding], list[Closed]]:
     """(causes, gap of each channel without them and with those that are likelier there than not).
 
     ``beside`` is known to be there and no part of the channels.
     """
     found = _with_readings(findings(channels), channels, joint, told_numbers(beside))
-    found = _as_late(found, joint, told_numbers(beside))
+    controller = joint.nominal.controller
+    if joint.simulation is not None and controller is not None:
+        known, tick_s = told_numbers(beside), 1.0 / controller.rate_hz
+        found = as_late(found, joint.simulation, known, allowed, tick_s, guessed=joint.guessed)
     return found, gaps_left(channels, found)
 
 
@@ -156,7 +159,7 @@ def in_the_loop(joint: Prepared, along: Reading, sought: Sequence[Finding] = ())
     if loop is None:
         return None
     channels = [sampled(Posterior(loop, len(along.allowed))), *others]
-    found, gaps = _read(channels, joint, sought)
+    found, gaps = _read(channels, joint, along.allowed, sought)
     if sought:
         found = [*sought, *(f for f in found if f.effect not in {one.effect for one in sought})]
         reasons = {**along.reasons, "link": f"{sought[0].effect} {SOUGHT}"}
@@ -193,27 +196,3 @@ def _loop_share(name: str, values: Mapping[str, float], share: str, beside: Effe
     """Whether the controller acts on what is reported, 1 or 0: as the simulated joint comes nearer to its recording."""
     gaps_nm = {acts: simulation.fitted_gap_nm({**beside, name: {**values, share: acts}}) for acts in (0.0, 1.0)}
     return min(gaps_nm, key=lambda acts: gaps_nm[acts])
-
-
-def _as_late(found: list[Finding], joint: Prepared, beside: Effects) -> list[Finding]:
-    """The findings, a drive as much later than its torque tells as brings the simulated joint clearly nearer."""
-    controller, simulation = joint.nominal.controller, joint.simulation
-    if simulation is None or controller is None:
-        return found
-    there = {**beside, **told_numbers(f for f in found if f.chance >= EVEN)}
-    result = []
-    for cause in found:
-        form = all_effects()[cause.effect].actuation
-        if form is not None and form.unreported_ticks and cause.where == "actuation" and cause.effect in there:
-            name, tick_s = form.parameter, form.unreported_ticks / controller.rate_hz
-            read_s = there[cause.effect][name]
-            squares = {
-                share: simulation.fitted_gap_nm({**there, cause.effect: {name: read_s + share * tick_s}}) ** 2
-                for share in UNREPORTED
-            }
-            more = min(squares, key=lambda share: squares[share])
-            if squares[0.0] - squares[more] > REMAINS**2 * max(squares[0.0] - simulation.noise_nm**2, 0.0):
-                told = cause.parameters[name].moved(more * tick_s, UNREPORTED[1] * tick_s)
-                cause = replace(cause, parameters={**cause.parameters, name: told})
-        result.append(cause)
-    return result
