@@ -82,6 +82,8 @@ def _others(joint: Prepared, along: Reading, answer: Diagnosis) -> Iterator[Read
         if (link := beside_a_link(joint, stiff, along.allowed)) is not None:
             yield link
     along_nm, loop_nm = answer.noise_floor.inverse_nm, answer.noise_floor.forward_torque_nm
+    if "encoder" in answer.reasons:
+        yield along
     coarse = along_nm is not None and loop_nm is not None and loop_nm < COARSE * along_nm
     if coarse and "encoder" not in answer.reasons and (loop := in_the_loop(joint, along)) is not None:
         yield loop
@@ -160,10 +162,14 @@ def _ranked(
     noise_nm = _noise_nm(simulation, gaps)
     if noise_nm == 0.0 or len(said.named) < 2:
         return said  # no log has a torque, or there is nothing to put in order
-    sizes = {f.effect: 0.0 if guessed and f.where == "actuation" else f.size for f in said.named}
+    idle = borne.idle if borne is not None else frozenset[str]()
+    untold = {f.effect for f in said.named if guessed and f.where == "actuation"}
+    # What is read from the closed loop's torque and brings the simulated joint no nearer shows nowhere.
+    untold |= {f.effect for f in said.named if f.where == "loop" and f.effect in idle}
+    sizes = {f.effect: 0.0 if f.effect in untold else f.size for f in said.named}
     made_nm = simulation.made_nm([told_numbers([f]) for f in said.named])
     for f, made in zip(said.named, made_nm, strict=True):
-        if borne is None or f.effect not in borne.idle:
+        if f.effect not in idle:
             sizes[f.effect] = max(sizes[f.effect], math.sqrt(f.chance) * made / noise_nm)
     refuted = borne.refuted if borne is not None else ()
     return replace(said, named=tuple(sorted(said.named, key=lambda f: (f.effect in refuted, -sizes[f.effect]))))
