@@ -116,7 +116,7 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     quiet = quiet_before_any_filter(reading.measured, negligible)
     small = quiet and (joint.simulation is None or pooled(joint.simulation.bare, "torque_nm") <= HALF * nothing_nm)
     if quiet and joint.simulation is not None:
-        quiet = quiet_in_the_loop(joint.simulation, reading.found, channels, gaps, nothing_nm)
+        quiet = quiet_in_the_loop(joint.simulation, reading.found, channels, gaps, nothing_nm, guessed=joint.guessed)
     still = joint.guessed and _still(joint.simulation, gaps)
     said = verdict(reading.found, channels, gaps, nothing_nm, quiet, joint.simulation is not None, still, small)
     if reading.sought:

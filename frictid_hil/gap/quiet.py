@@ -9,7 +9,16 @@ from frictid_hil.gap.experiment_set import Nominal
 from frictid_hil.gap.findings import EVEN, Finding, Sampled, told_numbers
 from frictid_hil.gap.forward import Simulation, pooled
 from frictid_hil.gap.how_far import Closed
-from frictid_hil.gap.verdict import AS_STATED, FLOORS, FLOORS_AS_STATED, STANDS_OUT, as_stated, expected, needed
+from frictid_hil.gap.verdict import (
+    AS_STATED,
+    FLOORS,
+    FLOORS_AS_STATED,
+    SHOWS,
+    STANDS_OUT,
+    as_stated,
+    expected,
+    needed,
+)
 
 NEGLIGIBLE = 0.05
 """Gap that means nothing in practice, over the friction level: friction repeats to about this from day to day."""
@@ -39,25 +48,30 @@ def quiet_in_the_loop(
     channels: Sequence[Sampled],
     gaps: Sequence[Closed],
     nothing_nm: float,
+    *,
+    guessed: bool,  # what the controller asks for falls between the rows of the logs
 ) -> bool:
     """Whether the simulated closed loop shows no gap, or none with what the belief may well be wrong by."""
-    quiet_nm = _quiet_nm(gaps, simulation.noise_nm, nothing_nm)
+    quiet_nm = _quiet_nm(gaps, simulation.noise_nm, nothing_nm, guessed=guessed)
     if pooled(simulation.bare, "torque_nm") <= quiet_nm:
         return True
     tolerable = _tolerable(found, channels, gaps, nothing_nm)
     return bool(tolerable) and simulation.gap_nm(tolerable) <= quiet_nm
 
 
-def _quiet_nm(gaps: Sequence[Closed], known_nm: float, nothing_nm: float) -> float:
+def _quiet_nm(gaps: Sequence[Closed], known_nm: float, nothing_nm: float, *, guessed: bool) -> float:
     """The torque gap of the simulated closed loop that is no more than noise, N m.
 
     Noise is as the actuation has it, or ``known_nm``, which white noise and an encoder's steps make. What the steps
-    make of the torque is known in a replay, and another draw of them in a simulation.
+    make of the torque is known in a replay, and another draw of them in a simulation. A gap in which nothing shows
+    beside the noise of an actuation without causes is that noise, white or not, unless the demand is ``guessed``.
     """
-    noise = next((gap.floor for gap in gaps if gap.channel == "actuation"), None)
-    if noise is None:
+    actuation = next((gap for gap in gaps if gap.channel == "actuation"), None)
+    if actuation is None:
         return math.inf
-    return min(FLOORS * max(noise, known_nm), max(LOUD * known_nm, nothing_nm))
+    noise = actuation.floor
+    alone = 0.0 if guessed or actuation.before > SHOWS * noise else SHOWS * noise
+    return min(FLOORS * max(noise, known_nm), max(LOUD * known_nm, alone, nothing_nm))
 
 
 def _tolerable(

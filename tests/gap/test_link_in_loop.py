@@ -9,12 +9,13 @@ from typing import Any, cast
 
 import pytest
 
-from frictid_hil.gap import reading
 from frictid_hil.gap.diagnosis import Value
+from frictid_hil.gap.drive_in_loop import as_late
 from frictid_hil.gap.findings import Finding
 from frictid_hil.gap.forward import Effects, Simulation
 from frictid_hil.gap.link_in_loop import link_in_loop
 from frictid_hil.gap.verdict import DOUBTED
+from frictid_hil.simulation.effects import all_effects
 
 PLAY_RAD, STIFFNESS = 0.012, 3e5
 LINKS = ("backlash", "joint_elasticity")
@@ -73,11 +74,26 @@ def test_a_delay_is_moved_within_one_tick_where_the_loop_comes_clearly_nearer(tr
     def gap_nm(effects: Mapping[str, Mapping[str, float]]) -> float:
         return 0.05 + 500.0 * abs(effects["torque_delay"]["delay_s"] - true_s)
 
-    joint = SimpleNamespace(
-        simulation=simulation(gap_nm), nominal=SimpleNamespace(controller=SimpleNamespace(rate_hz=500.0))
-    )
     delay = Finding("torque_delay", 0.99, 0.99, 9.0, 1.0, {"delay_s": Value(0.004, 0.0035, 0.0045)}, (), "actuation")
-    (moved,) = reading._as_late([delay], cast(Any, joint), {})
+    (moved,) = as_late([delay], simulation(gap_nm), {}, list(all_effects()), 0.002, guessed=False)
     value = moved.parameters["delay_s"]
     assert value.value == pytest.approx(told_s) and value.low is not None and value.high is not None
     assert value.low < true_s < value.high
+
+
+@pytest.mark.parametrize("there", ["electrical_lag", "torque_delay"])
+def test_how_late_a_drive_is_and_in_which_way_is_sought_in_closed_loop_where_logs_lack_ticks(there: str) -> None:
+    true = {"electrical_lag": {"time_constant_s": 0.0062}, "torque_delay": {"delay_s": 0.0062}}[there]
+
+    def gap_nm(effects: Mapping[str, Mapping[str, float]]) -> float:
+        (value,), (sought,) = effects.get(there, {"": 0.0}).values(), true.values()
+        return 0.05 + 500.0 * abs(value - sought)
+
+    delay = Finding("torque_delay", 0.99, 0.99, 9.0, 1.0, {"delay_s": Value(0.013, 0.008, 0.018)}, (), "actuation")
+    (told,) = as_late([delay], simulation(gap_nm), {}, list(all_effects()), 0.001, guessed=True)
+    (value,) = told.parameters.values()
+    assert told.effect == there and value.value == pytest.approx(0.0062, rel=0.06)
+    assert value.low is not None and value.high is not None and value.low < 0.0062 < value.high
+    assert ("torque_delay" in told.rivals) == (there == "electrical_lag")
+    (as_read,) = as_late([delay], simulation(gap_nm), {}, ["torque_delay"], 0.001, guessed=False)
+    assert as_read.effect == "torque_delay"
