@@ -85,8 +85,10 @@ def verdict(
     tiny = quiet and all(gap.before <= min(floors * gap.floor, negligible) for gap in gaps)
     shows = any(gap.before > SHOWS * gap.floor for gap in gaps)
     # What identification logs plainly hold is no "none" because the validation logs never came to it.
-    tiny = tiny and not told and not sure and not (shows and any(needed(f, channels) for f in named))
-    doubtful = all(f.chance < EVEN for f in named)  # no reason to call a gap within noise anything but none
+    known = any(needed(f, channels) for f in named)
+    tiny = tiny and not told and not sure and not (shows and known)
+    # No reason to call a gap within noise anything but none.
+    doubtful = all(f.chance < EVEN for f in named) or not (shows or sure or known)
     if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):
         return Verdict("none", ())
     # Where functions without a name describe it as well, the names tell the gap only if they close it, and not at all

@@ -138,3 +138,15 @@ def test_a_small_gap_that_tolerances_make_is_none_where_hardly_a_draw_needs_a_ca
     drawn = replace(drawn, draws=draws)
     gap = Closed("plant", before, 1.0, 0.9, 1.1, floor=1.0)
     assert verdict([], [drawn], [gap], 10.0, otherwise_quiet=False, small=small).word == word
+
+
+@pytest.mark.parametrize(
+    ("before", "share", "word"), [(1.2, 0.7, "none"), (1.2, 0.96, "explained"), (1.6, 0.7, "explained")]
+)
+def test_a_cause_that_some_draws_do_without_is_none_where_no_gap_shows(before: float, share: float, word: str) -> None:
+    drawn = channel("plant", CAUSE, 1.05, np.ones(DRAWS))
+    without: Any = SimpleNamespace(model=SimpleNamespace(effects=frozenset()), values=np.zeros(1))
+    drawn = replace(drawn, draws=[d if k < share * DRAWS else without for k, d in enumerate(drawn.draws)])
+    cause = Finding(CAUSE, share, share, 1.05, share, {}, (), "plant")
+    gap = Closed("plant", before, 0.9, 0.8, 1.0, floor=1.0)
+    assert verdict([cause], [drawn], [gap], 0.0, otherwise_quiet=True).word == word
