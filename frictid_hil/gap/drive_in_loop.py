@@ -30,7 +30,7 @@ def as_late(
 ) -> list[Finding]:
     """The findings, a drive late by what brings the simulated joint clearly nearer, and in the way that does."""
     there = {**beside, **told_numbers(f for f in found if f.chance >= EVEN)}
-    result = []
+    result: list[Finding] = []
     for cause in found:
         form = forms().get(cause.effect)
         if form is not None and form.late and cause.where == "actuation" and cause.effect in there:
@@ -40,7 +40,8 @@ def as_late(
             elif form.unreported_ticks:
                 cause = _within_a_tick(cause, others, simulation, form.unreported_ticks * tick_s)
         result.append(cause)
-    return result
+    renamed = {one.effect for one, before in zip(result, found, strict=True) if one.effect != before.effect}
+    return [f for f, before in zip(result, found, strict=True) if before.effect not in renamed]
 
 
 def _within_a_tick(cause: Finding, others: Effects, simulation: Simulation, most_s: float) -> Finding:

@@ -85,10 +85,9 @@ def verdict(
     tiny = quiet and all(gap.before <= min(floors * gap.floor, negligible) for gap in gaps)
     shows = any(gap.before > SHOWS * gap.floor for gap in gaps)
     # What identification logs plainly hold is no "none" because the validation logs never came to it.
-    known = any(needed(f, channels) for f in named)
+    known = sure or any(needed(f, channels) for f in named)
     tiny = tiny and not told and not sure and not (shows and known)
-    # No reason to call a gap within noise anything but none.
-    doubtful = all(f.chance < EVEN for f in named) or not (shows or sure or known)
+    doubtful = all(f.chance < EVEN for f in named) or not (shows or known)  # within noise, so as well none
     if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):
         return Verdict("none", ())
     # Where functions without a name describe it as well, the names tell the gap only if they close it, and not at all
@@ -101,7 +100,7 @@ def verdict(
     if unexplained:
         # A link that swings may be no help along the motion, and close the loop all the same.
         return Verdict("unknown", named or tuple(f for f in found if f.chance >= LISTED and swings(f.effect)), place)
-    if (varies := next((f for f in named if f.chance >= EVEN and _varies(f, channels)), None)) is not None:
+    if varies := next((f for f in named if f.chance >= EVEN and _varies(f, channels)), None):
         return Verdict("unknown", named, f"{varies.where}: {varies.effect} that comes and goes")
     if _unnamed(loud) or _off_its_form(loud) or any(stays(gap, REMAINS) for gap in gaps):
         # What stays may be of another cause. An error within its tolerance is to be expected, whatever else is there.
