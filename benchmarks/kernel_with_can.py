@@ -39,6 +39,14 @@ $b poweroff -f
 """
 
 
+_UNFIT = "set fp regs failed"
+"""What the kernel prints on a processor whose floating-point state is larger than it knows."""
+
+
+class UnfitError(RuntimeError):
+    """This computer's processor is newer than the kernel knows: no process runs in it."""
+
+
 def missing() -> str:
     """What this computer lacks for it; "" for nothing."""
     lacking = [
@@ -56,6 +64,7 @@ def run(script: Path, folder: Path, *, timeout_s: float) -> str:
         timeout_s: longest duration.
 
     Raises:
+        UnfitError: the kernel runs no process on this processor.
         RuntimeError: the kernel did not start, or the script failed; with what was printed.
         subprocess.TimeoutExpired: it took longer.
     """
@@ -102,6 +111,8 @@ def run(script: Path, folder: Path, *, timeout_s: float) -> str:
             raise
     said, ended = folder / "said", folder / "ended"
     if not ended.exists() or ended.read_text().strip() != "0":
+        if _UNFIT in printed:
+            raise UnfitError(f"the kernel of user-mode-linux runs no process on this processor ({_UNFIT})")
         raise RuntimeError(printed[-3000:] + (said.read_text() if said.exists() else ""))
     return said.read_text()
 
