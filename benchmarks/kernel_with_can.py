@@ -9,12 +9,14 @@ of timing means nothing, and rates stay at 50 Hz. Debian's packages `user-mode-l
 
 from __future__ import annotations
 
+import functools
 import os
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 from platformdirs import user_cache_path
@@ -26,6 +28,15 @@ _NEEDED = (
 )  # fmt: skip
 _PASSED_ON = ("PATH", "HOME", "LANG")
 
+_LARGE_STATE = "amx_tile"
+_NO_PROCESS = (
+    "the kernel of user-mode-linux runs no process on this processor: its floating-point state (AMX) is too large"
+)
+_FIRST = """#!{busybox} sh
+{busybox} mount -t hostfs -o {folder} none {folder}
+echo 0 > {folder}/ended
+{busybox} poweroff -f
+"""
 _INIT = """#!{busybox} sh
 b={busybox}
 $b mount -t proc proc /proc; $b mount -t sysfs sys /sys
@@ -39,20 +50,26 @@ $b poweroff -f
 """
 
 
-_UNFIT = "set fp regs failed"
-"""What the kernel prints on a processor whose floating-point state is larger than it knows."""
-
-
-class UnfitError(RuntimeError):
-    """This computer's processor is newer than the kernel knows: no process runs in it."""
-
-
+@functools.cache
 def missing() -> str:
     """What this computer lacks for it; "" for nothing."""
     lacking = [
         package for program, package in ((KERNEL, "user-mode-linux"), ("busybox", "busybox")) if not _at(program)
     ]
-    return f"not installed: Debian's {' and '.join(lacking)}" if lacking else ""
+    if lacking:
+        return f"not installed: Debian's {' and '.join(lacking)}"
+    return "" if _LARGE_STATE not in Path("/proc/cpuinfo").read_text() or _starts() else _NO_PROCESS
+
+
+def _starts() -> bool:
+    """Whether a process runs in that kernel: its first one writes a file."""
+    with tempfile.TemporaryDirectory(prefix="frictid-kernel-") as name:
+        folder = Path(name)
+        init = folder / "init"
+        init.write_text(_FIRST.format(busybox=_at("busybox"), folder=folder))
+        init.chmod(0o755)
+        _boot(init, folder, timeout_s=60.0)
+        return (folder / "ended").exists()
 
 
 def run(script: Path, folder: Path, *, timeout_s: float) -> str:
@@ -64,7 +81,6 @@ def run(script: Path, folder: Path, *, timeout_s: float) -> str:
         timeout_s: longest duration.
 
     Raises:
-        UnfitError: the kernel runs no process on this processor.
         RuntimeError: the kernel did not start, or the script failed; with what was printed.
         subprocess.TimeoutExpired: it took longer.
     """
@@ -96,6 +112,15 @@ def run(script: Path, folder: Path, *, timeout_s: float) -> str:
         )
     )
     init.chmod(0o755)
+    printed = _boot(init, folder, timeout_s=timeout_s)
+    said, ended = folder / "said", folder / "ended"
+    if not ended.exists() or ended.read_text().strip() != "0":
+        raise RuntimeError(printed[-3000:] + (said.read_text() if said.exists() else ""))
+    return said.read_text()
+
+
+def _boot(init: Path, folder: Path, *, timeout_s: float) -> str:
+    """What the kernel prints until it stops."""
     command = [
         _at(KERNEL), "mem=1024M", "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "ro", f"init={init}",
         f"uml_dir={folder}", "umid=kernel", "con=null", "con0=null,fd:1", "quiet", "panic=-1",
@@ -109,12 +134,7 @@ def run(script: Path, folder: Path, *, timeout_s: float) -> str:
         except subprocess.TimeoutExpired:
             os.killpg(kernel.pid, signal.SIGKILL)  # its processes are processes here, too
             raise
-    said, ended = folder / "said", folder / "ended"
-    if not ended.exists() or ended.read_text().strip() != "0":
-        if _UNFIT in printed:
-            raise UnfitError(f"the kernel of user-mode-linux runs no process on this processor ({_UNFIT})")
-        raise RuntimeError(printed[-3000:] + (said.read_text() if said.exists() else ""))
-    return said.read_text()
+    return printed
 
 
 def _at(program: str) -> str:

@@ -23,14 +23,6 @@ pytestmark = [
 ]
 
 
-def beside_a_link(script, folder, timeout_s=570.0):
-    """Run a script there; skipped on a processor that the kernel does not know."""
-    try:
-        kernel_with_can.run(script, folder, timeout_s=timeout_s)
-    except kernel_with_can.UnfitError as why:
-        pytest.skip(f"no SocketCAN here: {why}")
-
-
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
     """Everything that was tried there, in one go: a kernel takes seconds to start, and the packages as long to load."""
@@ -38,7 +30,7 @@ def found(tmp_path_factory):
     rack = Rack()
     rack.install(load_robot(guest.robot_file(folder)).to_setup())
     rack.warm_up()  # compiled here, where it is quick
-    beside_a_link(FOLDER / "socketcan_guest.py", folder)
+    kernel_with_can.run(FOLDER / "socketcan_guest.py", folder, timeout_s=570.0)
     return json.loads((folder / "found.json").read_text())
 
 
@@ -81,7 +73,7 @@ def test_a_classical_link_is_refused_for_can_fd_and_the_command_told(found):
 
 def test_behind_another_authors_canopen_on_that_link(tmp_path):
     pytest.importorskip("durand", reason="durand (of the extra dev) is not installed")
-    beside_a_link(FOLDER / "socketcan_strangers.py", tmp_path)
+    kernel_with_can.run(FOLDER / "socketcan_strangers.py", tmp_path, timeout_s=570.0)
     found = json.loads((tmp_path / "found.json").read_text())
     assert all(one["good"] for one in found.values()), found
 
@@ -90,7 +82,7 @@ def test_a_script_that_fails_there_fails_here(tmp_path):
     script = tmp_path / "fails.py"
     script.write_text("import sys\nsys.exit('as it should')\n")
     with pytest.raises(RuntimeError, match="as it should"):
-        beside_a_link(script, tmp_path, 60.0)
+        kernel_with_can.run(script, tmp_path, timeout_s=60.0)
 
 
 def test_of_that_kernel_nothing_is_left(found):
