@@ -207,7 +207,7 @@ def _recording(nominal: Nominal, raw: Experiment, start_s: float, late: float | 
     return Recording(experiment, step_s, resampled, view, plant, demand, actuation, kinematic)
 
 
-@functools.lru_cache(maxsize=32)
+@functools.lru_cache(maxsize=16)  # two sets; the logs of a set are asked for several times
 def uniform(experiment: Experiment) -> tuple[Experiment, float, bool]:
     """The experiment on a clock of equal steps; (it, step in s, whether it had to be resampled)."""
     steps = np.diff(experiment.time_s)

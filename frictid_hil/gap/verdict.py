@@ -196,8 +196,7 @@ def _first_with(cause: Finding, channels: Sequence[Sampled]) -> tuple[Sampled, D
 
 def swings(cause: str) -> bool:
     """Whether a cause lets the link swing, so that its columns along a motion may lose the link's phase."""
-    form = all_effects()[cause].inverse
-    return form is not None and form.swings
+    return all_effects()[cause].swings
 
 
 def _varies(cause: Finding, channels: Sequence[Sampled]) -> bool:

@@ -155,6 +155,11 @@ class Effect:
         """The parameters whose ``off`` value makes the effect vanish."""
         return tuple(parameter for parameter in self.parameters if parameter.off is not None)
 
+    @property
+    def swings(self) -> bool:
+        """Whether it lets the link swing by itself."""
+        return self.inverse is not None and self.inverse.swings
+
     def complete(self, given: Mapping[str, float]) -> dict[str, float]:
         """All parameters: the given ones, typical values for shapes left out, off for strengths left out."""
         return {**self.off, **given}
