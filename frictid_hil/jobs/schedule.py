@@ -56,7 +56,7 @@ def schedule(options: ScheduleOptions) -> dict[str, Any]:
         )
     if options.system and options.out is None:
         _refuse_without_account(options.user)
-    elapses = next_elapse(options.on_calendar)
+    elapses = next_elapse(with_last_day(options.on_calendar))
     name = f"frictid-hil-{robot.name}"
     units = {f"{name}.service": _service(options, robot), f"{name}.timer": _timer(options, robot)}
     verified = verify(units, system=options.system)
@@ -240,7 +240,7 @@ def _timer(options: ScheduleOptions, robot: Robot) -> str:
 Description=When robot {robot.name} is recalibrated
 
 [Timer]
-OnCalendar={options.on_calendar}
+OnCalendar={with_last_day(options.on_calendar)}
 # A night missed while the computer was off is made up for by a simulated robot only.
 {missed}
 AccuracySec=1min
@@ -281,7 +281,22 @@ _SHORTHANDS = {
 _SHORTHANDS |= {"annually": _SHORTHANDS["yearly"], "biannually": _SHORTHANDS["semiannually"]}
 _SHORTHANDS |= {"bi-annually": _SHORTHANDS["semiannually"], "semi-annually": _SHORTHANDS["semiannually"]}
 _VALUES = {"minute": range(60), "hour": range(24), "day": range(1, 32), "month": range(1, 13)}
+_OPEN_STEP = re.compile(r"(?<![\d.])(\d+)/(\d+)", re.ASCII)
 _PART = re.compile(r"(\d+)(?:\.\.(\d+))?(?:/(\d+))?", re.ASCII)
+
+
+def with_last_day(on_calendar: str) -> str:
+    """The expression with every step through the days of a month said to its end: ``1/4`` is ``1..31/4``.
+
+    They mean the same; of the first, systemd 252 leaves out what comes in January before the day at which the step of
+    December ends.
+    """
+    words = on_calendar.split()
+    for at, word in enumerate(words):
+        rest, dash, days = word.rpartition("-")
+        if dash and ":" not in word and "~" not in word:
+            words[at] = rest + dash + _OPEN_STEP.sub(rf"\1..{_VALUES['day'][-1]}/\2", days)
+    return " ".join(words)
 
 
 def cron_fields(on_calendar: str) -> str:

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from frictid_hil.errors import UsageError
-from frictid_hil.jobs.schedule import cron_fields
+from frictid_hil.jobs.schedule import cron_fields, with_last_day
 
 needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
 BASE = datetime(2027, 12, 27, 0, 0)
@@ -77,12 +77,33 @@ TIMES = st.tuples(component(0, 23), component(0, 59), st.sampled_from(["", ":00"
 SHORT = st.sampled_from(["daily", "weekly", "monthly", "hourly", "yearly", "quarterly", "minutely", "semi-annually"])
 
 
+@needs_systemd
+def test_a_timer_leaves_out_no_day_at_the_turn_of_the_year() -> None:
+    days = [when.date().isoformat() for when in times_of_systemd(with_last_day("*-*-1/4 02:00"), 3) or ()]
+    assert days == ["2027-12-29", "2028-01-01", "2028-01-05"]
+
+
+@pytest.mark.parametrize(
+    ("given", "written"),
+    [
+        ("Mon..Fri 02:30", "Mon..Fri 02:30"),
+        ("*-*-1/4 *:00", "*-*-1..31/4 *:00"),
+        ("*-2/3-05,7/9 1/2:00", "*-2/3-05,7..31/9 1/2:00"),
+        ("2027-01-1..9/2", "2027-01-1..9/2"),
+        ("*-02~03/1", "*-02~03/1"),
+        ("semi-annually", "semi-annually"),
+    ],
+)
+def test_steps_through_a_month_are_said_to_its_last_day(given: str, written: str) -> None:
+    assert with_last_day(given) == written
+
+
 @pytest.mark.slow
 @needs_systemd
 @settings(max_examples=100, deadline=None)
 @given(st.one_of(SHORT, st.tuples(WEEKDAYS, DATES, TIMES).map("".join)))
 def test_a_cron_line_says_exactly_what_systemd_does(expression: str) -> None:
-    meant = times_of_systemd(expression, 40)
+    meant = times_of_systemd(with_last_day(expression), 40)
     try:
         fields = cron_fields(expression)
     except UsageError:
