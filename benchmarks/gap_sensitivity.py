@@ -66,7 +66,7 @@ LATE: tuple[tuple[ModuleType, str], ...] = (
     (verdict, "FLOORS"), (verdict, "AS_STATED"), (verdict, "MOST_EXPECTED"), (verdict, "FLOORS_AS_STATED"),
     (verdict, "STANDS_OUT"), (verdict, "REMAINS"), (verdict, "DOUBTED"), (verdict, "HALF"),
     (verdict, "LISTED"), (verdict, "NEEDED"), (verdict, "CERTAIN"), (verdict, "EVEN"), (verdict, "LEADS"),
-    (verdict, "FORMS_OFF"),
+    (verdict, "FORMS_OFF"), (verdict, "VARIES"),
     (borne_out, "BOUNCED"), (borne_out, "REFUTED"), (borne_out, "FAR"), (link_in_loop, "LOGS"),
     (link_in_loop, "SPREAD"),
     (how_far, "COLOUR"), (how_far, "APPEARED"), (how_far, "WINDOW_S"),

@@ -120,7 +120,7 @@ def _without(
     helping = told_numbers(f for f in stands if f.effect in kept)
     stands, gap_nm = _refined(stands, helping, loop, gap_nm)
     told = _told(kept, refuted, loop, gap_nm)
-    if (kept and not _stays(_may_stay(kept), gap_nm, loop)) or any(f.where == READ_DIRECTLY for f in stands):
+    if _closes(said, kept, gap_nm, loop) or any(f.where == READ_DIRECTLY for f in stands):
         # What is read from the positions themselves is there, whatever the loop makes of the others.
         return Verdict("explained", (*stands, *falls)), told
     return Verdict("unknown", (*stands, *falls), said.place or NO_NEARER), told
@@ -135,7 +135,7 @@ def _closed(
         if told is not None:
             return rescued, told
     shows = loop.before_nm > FLOORS * loop.floor_nm
-    if kept and shows and not _stays(_may_stay(kept), gap_nm, loop) and not said.place.startswith("actuation"):
+    if shows and _closes(said, kept, gap_nm, loop):
         named = sorted(said.named, key=lambda f: f.effect not in kept)
         return _doubted(Verdict("explained", tuple(named))), _told(kept, set(), loop, gap_nm)
     return said, None
@@ -160,6 +160,11 @@ def _instead_of(cause: Finding, falls: Sequence[Finding]) -> Finding:
     gained = sum(f.chance for f in falls if f.effect in cause.rivals or cause.effect in f.rivals)
     chance, confidence = (max(c, min(DOUBTED, c + gained)) for c in (cause.chance, cause.confidence))
     return replace(cause, chance=chance, confidence=confidence)
+
+
+def _closes(said: Verdict, kept: Collection[str], gap_nm: float, loop: Loop) -> bool:
+    """Whether these causes close the loop, and what has no name is not between demand and torque: that is seen."""
+    return bool(kept) and not _stays(_may_stay(kept), gap_nm, loop) and not said.place.startswith("actuation")
 
 
 def _may_stay(kept: Collection[str]) -> float:

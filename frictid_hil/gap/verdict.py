@@ -29,6 +29,7 @@ DOUBTED = 0.89
 """Most that is claimed of causes beyond a tolerance that leave a part of the gap, or close one that functions without
 a name would describe as well: less than what counts as sure. Of 41 drawn causes that were held at it, 36 were there."""
 HALF = 0.5  # part of a gap from which on it is open although causes were named
+VARIES = 1.0 / 3.0  # spread of a cause's strength, over itself, from which on it comes and goes
 FORMS_OFF = 2.0  # one-sigma of a form by which it may well be off
 HELPS = 0.98  # gap of the validation logs with the causes over that without, above which they explain nothing there
 READ_DIRECTLY = "kinematics"  # where a cause is read from positions and velocities themselves
@@ -200,7 +201,7 @@ def swings(cause: str) -> bool:
 
 
 def _varies(cause: Finding, channels: Sequence[Sampled]) -> bool:
-    """Whether a cause between demand and torque is as strong at one moment as at another, to about half of itself.
+    """Whether a cause between demand and torque is stronger at one moment than at another, by ``VARIES`` of itself.
 
     That channel is replayed exactly, so that what stays has the size of noise. If instead its square grows with the
     square of what the cause makes, by a share v, then the cause's strength has a spread of sqrt(v) of itself.
@@ -213,7 +214,7 @@ def _varies(cause: Finding, channels: Sequence[Sampled]) -> bool:
     made = _levelled([(log.x[:, columns] @ values)[log.told] for log in logs])
     about = made**2 - np.mean(made**2)
     rest = _levelled([(log.y - log.x @ theta)[log.told] for log in logs])
-    return float(about @ rest**2) > HALF**2 * float(about @ about)
+    return float(about @ rest**2) > VARIES**2 * float(about @ about)
 
 
 def _levelled(parts: Sequence[np.ndarray]) -> np.ndarray:

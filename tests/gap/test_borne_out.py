@@ -249,6 +249,20 @@ def test_what_has_no_name_along_the_motion_is_no_gap_where_the_causes_close_the_
         assert borne.idle == {"gravity_error"}
 
 
+@pytest.mark.parametrize(
+    ("place", "word"), [("plant: time", "explained"), ("actuation: a cause that comes and goes", "unknown")]
+)
+def test_a_loop_that_closes_once_a_cause_is_refuted_says_nothing_of_what_is_seen_by_itself(
+    place: str, word: str
+) -> None:
+    """Commands that a drive misses now and then were a lag, as the loop refuted another small cause beside it."""
+    named = (cause("electrical_lag", "actuation"), cause("torque_constant_error"))
+    gaps = {"electrical_lag": 0.1, "torque_constant_error": 1.6, "electrical_lag+torque_constant_error": 1.0}
+    said, told = answer(Verdict("unknown", named, place), loop(gaps))
+    assert said.word == word and said.named[1].chance == REFUTED
+    assert told is not None and "0.1 with electrical_lag" in told
+
+
 def test_a_cause_without_numbers_is_not_simulated() -> None:
     """It took its typical size, and was borne out or refuted by that."""
     unknown = replace(cause("stribeck"), parameters={})
