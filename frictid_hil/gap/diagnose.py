@@ -39,6 +39,7 @@ from frictid_hil.gap.verdict import (
     Verdict,
     stays,
     swings,
+    unreached,
     verdict,
 )
 from frictid_hil.simulation.effects import all_effects
@@ -128,6 +129,8 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
         said = _ranked(said, joint.simulation, gaps, guessed=joint.guessed)
         judge = _loop(joint.simulation, reading, said, nothing_nm, guessed=joint.guessed)
         borne = borne_out(said, judge, open_along=_open_along(reading))
+        # What the validation logs never come to brings them no nearer, and is not idle for that.
+        borne = replace(borne, idle=borne.idle - {f.effect for f in said.named if unreached(f, channels)})
         said = _ranked(borne.said, joint.simulation, gaps, guessed=joint.guessed, borne=borne)
         if borne.told is not None:
             reasons["closed_loop"] = borne.told

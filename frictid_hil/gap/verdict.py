@@ -62,9 +62,9 @@ def verdict(
     small: bool = False,  # before any filter, and to half of what is negligible in closed loop, there is no gap
 ) -> Verdict:
     """Decide."""
-    unreached = [f for f in found if needed(f, channels) and _unreached(f, channels)]
+    missed = [f for f in found if needed(f, channels) and unreached(f, channels)]
     shown = _shown(found, channels, gaps, otherwise_quiet)
-    named = tuple(f for f in found if f.chance >= LISTED and (f in shown or f in unreached))
+    named = tuple(f for f in found if f.chance >= LISTED and (f in shown or f in missed))
     quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
     explained = _root_sum([channel.explained for channel in channels])
     # What has no name in a demand that is a guess is the guess: there the closed loop tells what stays.
@@ -74,7 +74,7 @@ def verdict(
     place = _place([c for c, _ in telling])
     if any(f.where == READ_DIRECTLY for f in named):
         return Verdict("explained", named)
-    told = any(f in unreached for f in named)
+    told = any(f in missed for f in named)
     if loop_still and otherwise_quiet and not told and all(gap.before <= SHOWS * gap.floor for _, gap in telling):
         return Verdict("none", ())  # whatever causes a guess has
     sure = not _unnamed(channels) and any(_certain(f, channels, gaps) for f in named)
@@ -178,7 +178,7 @@ def _within(one_sigmas: float, error: Finding, belief: Term) -> bool:
     return all(abs(v.value) < one_sigmas * abs(one_sigma[name]) for name, v in error.parameters.items())
 
 
-def _unreached(cause: Finding, channels: Sequence[Sampled]) -> bool:
+def unreached(cause: Finding, channels: Sequence[Sampled]) -> bool:
     """Whether the validation logs never come to where a cause shows, so that they say nothing of it."""
     if (found := _first_with(cause, channels)) is None:
         return False
