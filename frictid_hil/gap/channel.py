@@ -32,8 +32,9 @@ class Term:
     columns: tuple[int, ...]  # numbers of its columns in the channel's table
     mean: Array  # of the coefficients before anything is recorded, shape (k,)
     deviation: Array  # one-sigma of the same, shape (k,)
-    least: float = -math.inf  # of the first coefficient; below, it is another effect
-    largest: float = math.inf  # of the first coefficient
+    least: float = -math.inf  # of its bounded coefficients; below, it is another effect
+    largest: float = math.inf  # of the same
+    bounded: int = 1  # how many of its coefficients, from the first on, are bounded
 
 
 @dataclass(frozen=True, slots=True)

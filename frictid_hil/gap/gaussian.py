@@ -57,14 +57,22 @@ def integrated(gram: Array, inside: np.ndarray, outside: np.ndarray) -> tuple[Ar
 
 @njit(cache=True)
 def each_alone(
-    gram: Array, right: Array, centre: Array, starts: np.ndarray, sizes: np.ndarray, held: np.ndarray, solved: Array
+    gram: Array,
+    right: Array,
+    centre: Array,
+    starts: np.ndarray,
+    sizes: np.ndarray,
+    bounded: np.ndarray,
+    held: np.ndarray,
+    solved: Array,
 ) -> tuple[Array, Array, Array]:
-    """What each block of columns adds to the log chance beside those ``held``, mean and variance of its first, (b,).
+    """What each block of columns adds to the log chance beside those ``held``, (b,); means and variances, (k,).
 
     ``gram`` (k, k) and ``right`` (k,) are of all columns, ``right`` less what the held ones say; ``centre`` (k,) holds
     the means before anything is recorded, ``solved`` (h, k) the Gram rows of the held columns over their own part.
+    Variances are those of the ``bounded`` columns (k,), 0 elsewhere.
     """
-    gain, mean, variance = np.empty(starts.size), np.empty(starts.size), np.empty(starts.size)
+    gain, mean, variance = np.empty(starts.size), np.zeros(right.size), np.zeros(right.size)
     most = np.max(sizes)
     inner, target, unit = np.empty((most, most)), np.empty(most), np.empty(most)
     for block in range(starts.size):
@@ -78,27 +86,29 @@ def each_alone(
                 inner[i, j] = entry
             target[i] = right[first + i] + centre[first + i]
             square += centre[first + i] ** 2
-            unit[i] = 0.0
-        unit[0] = 1.0
         log_determinant = _factored(inner, size)
         gain[block] = 0.5 * (_forward(inner, target, size) - square - log_determinant)
-        variance[block] = _forward(inner, unit, size)
         _backward(inner, target, size)
-        mean[block] = target[0]
+        for i in range(size):
+            mean[first + i] = target[i]
+            if bounded[first + i]:
+                unit[:size] = 0.0
+                unit[i] = 1.0
+                variance[first + i] = _forward(inner, unit, size)
     return gain, mean, variance
 
 
 @njit(cache=True)
 def together(
-    grams: Array, rights: Array, centre: Array, at: np.ndarray, firsts: np.ndarray
+    grams: Array, rights: Array, centre: Array, at: np.ndarray, chosen: np.ndarray
 ) -> tuple[Array, Array, Array]:
     """What some columns add to the log chance at every point of a grid, (g,), means and variances of some, (g, f).
 
     ``grams`` (g, k, k) and ``rights`` (g, k) are of all columns, ``at`` (c,) are these and ``centre`` (c,) their means
-    before anything is recorded; ``firsts`` (f,) counts among them.
+    before anything is recorded; ``chosen`` (f,) counts among them.
     """
     points, size = grams.shape[0], at.size
-    gain, mean, variance = np.empty(points), np.empty((points, firsts.size)), np.empty((points, firsts.size))
+    gain, mean, variance = np.empty(points), np.empty((points, chosen.size)), np.empty((points, chosen.size))
     inner, target, unit = np.empty((size, size)), np.empty(size), np.empty(size)
     square = np.sum(centre**2)
     for g in range(points):
@@ -109,10 +119,10 @@ def together(
         log_determinant = _factored(inner, size)
         gain[g] = 0.5 * (_forward(inner, target, size) - square - log_determinant)
         _backward(inner, target, size)
-        for f in range(firsts.size):
-            mean[g, f] = target[firsts[f]]
+        for f in range(chosen.size):
+            mean[g, f] = target[chosen[f]]
             unit[:] = 0.0
-            unit[firsts[f]] = 1.0
+            unit[chosen[f]] = 1.0
             variance[g, f] = _forward(inner, unit, size)
     return gain, mean, variance
 

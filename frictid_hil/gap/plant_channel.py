@@ -122,14 +122,15 @@ def _causes(
             continue
         told = [t for t in known if t.effect == name and STIFFNESS not in t.shape]
         for term in told:
-            least, largest = form.first_coefficient
-            _, visible = effect_prior(name, {}, form.regressors(views, {}), scale, form.first_coefficient)
+            least, largest = form.bounds
+            _, visible = effect_prior(name, {}, form.regressors(views, {}), scale, form.bounds)
             deviation = np.maximum(BEYOND * term.deviation, visible)
             candidates.append(replace(term, deviation=deviation, least=least, largest=largest))
         for shape in () if told else form.grid_for(measured):
             columns = form.regressors(views, shape)
-            mean, deviation = effect_prior(name, shape, columns, scale, form.first_coefficient)
-            candidates.append(Term(name, shape, builder.add(columns), mean, deviation, *form.first_coefficient))
+            mean, deviation = effect_prior(name, shape, columns, scale, form.bounds)
+            numbers = builder.add(columns)
+            candidates.append(Term(name, shape, numbers, mean, deviation, *form.bounds, form.bounded))
     if "presliding_hysteresis" in library:
         wrong = [t for t in known if t.effect == "presliding_hysteresis"]
         candidates += [replace(t, deviation=BEYOND * t.deviation) for t in wrong]

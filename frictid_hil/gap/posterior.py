@@ -46,6 +46,7 @@ SURE = 5.0
 """Mean of a coefficient over its one-sigma, from which on its term is a whole model of its cause; a lag between two
 shapes may be shared by them."""
 UNNAMED = FAMILY + "rest"  # what a draw holds besides its terms
+FREE = (-math.inf, math.inf)
 POINTS = 4  # points of the grid, the likeliest, at which all candidates are compared
 
 
@@ -205,13 +206,14 @@ class Posterior:
         safe = np.where(self._scale > 0.0, self._scale, np.inf)
         self._centre = (self._mean / safe)[self._first :]
         self._whole = np.array([abs(float(t.mean[0])) > SURE * float(t.deviation[0]) for t in candidates], dtype=bool)
-        bounds = np.array([[t.least, t.largest] for t in candidates])
+        ends = [(t.least, t.largest) if n < t.bounded else FREE for t in candidates for n in range(len(t.columns))]
+        bounds = np.array(ends).reshape(-1, 2)
         finite = np.isfinite(bounds)
-        scaled = np.where(finite, bounds, 0.0) / safe[self._first :][self._starts][:, None]
+        scaled = np.where(finite, bounds, 0.0) / safe[self._first :][:, None]
         self._low, self._high = np.where(finite, scaled, bounds).T
-        middle = self._centre[self._starts]
-        self._before = log_between(self._low - middle, self._high - middle)
+        self._before = log_between(self._low - self._centre, self._high - self._centre)
         self._bounded = np.any(finite, axis=1)
+        self._block = np.repeat(np.arange(len(candidates)), self._sizes)
 
     def model(self, terms: Sequence[int]) -> Model:
         """The score of a set of candidates."""
@@ -227,10 +229,9 @@ class Posterior:
     def _gains(self, terms: tuple[int, ...]) -> Array:
         """What a set adds to the log chance at every point of the grid, its prior included, shape (g,)."""
         at = np.concatenate([self._local[t] for t in terms])
-        firsts = np.cumsum([0, *(self._local[t].size for t in terms[:-1])])
-        bounded = [k for k, t in enumerate(terms) if self._bounded[t]]
-        own = np.array(terms)[bounded]
-        gains, mean, variance = together(self._grams, self._rights, self._expected(terms), at, firsts[bounded])
+        bounded = np.flatnonzero(self._bounded[at])
+        own = at[bounded]
+        gains, mean, variance = together(self._grams, self._rights, self._expected(terms), at, bounded)
         spread = np.sqrt(variance)
         held = log_between((self._low[own] - mean) / spread, (self._high[own] - mean) / spread)
         again = len(terms) - len({self.channel.candidates[t].effect for t in terms})
@@ -250,11 +251,11 @@ class Posterior:
         centre = self._centre.copy()
         for t in (t for effect in held for t in self._shapes[effect] if self._whole[t]):
             centre[self._local[t]] = 0.0
-        gains, mean, variance = each_alone(gram, right, centre, self._starts, self._sizes, at, solved)
-        own = self._bounded
+        gains, mean, variance = each_alone(gram, right, centre, self._starts, self._sizes, self._bounded, at, solved)
+        own = np.flatnonzero(self._bounded)
         spread = np.sqrt(variance[own])
         low, high = (self._low[own] - mean[own]) / spread, (self._high[own] - mean[own]) / spread
-        gains[own] += log_between(low, high) - self._before[own]
+        gains += np.bincount(self._block[own], log_between(low, high) - self._before[own], gains.size)
         gains += self._log_prior
         for effect, count in held.items():
             for t in self._shapes[effect]:
@@ -382,16 +383,17 @@ class Posterior:
         return result
 
     def _inside(self, model: Model, mean: Array, root: Array, random: np.random.Generator) -> Array:
-        """Scaled coefficients, the first one of every term between its bounds."""
-        first = mean.size - sum(self._local[t].size for t in model.terms)
-        starts = first + np.cumsum([0, *(self._local[t].size for t in model.terms)])[:-1].astype(int)
-        low, high = self._low[list(model.terms)], self._high[list(model.terms)]
+        """Scaled coefficients, those of a term between its bounds."""
+        own = np.concatenate([np.zeros(0, dtype=int), *(self._local[t] for t in model.terms)])
+        places = mean.size - own.size + np.flatnonzero(self._bounded[own])
+        own = own[self._bounded[own]]
+        low, high = self._low[own], self._high[own]
         values = mean
         for _ in range(REDRAWN):
             values = mean + root @ random.standard_normal(mean.size)
-            if np.all((values[starts] >= low) & (values[starts] <= high)):
+            if np.all((values[places] >= low) & (values[places] <= high)):
                 return values
-        return put_inside(values, root, starts, low, high)
+        return put_inside(values, root, places, low, high)
 
     def _coefficients(self, model: Model, g: int) -> tuple[np.ndarray, Array, Array]:
         """(columns, mean, square root of the covariance) of scaled coefficients at one point of the grid."""

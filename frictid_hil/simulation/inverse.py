@@ -60,8 +60,9 @@ class InverseForm:
     # (views in run order, shape) -> per view the columns, shape (n, k), N m per unit of coefficient.
     regressors: Callable[[Sequence[View], Shape], list[Array]]
     parameters: Callable[[Shape, Array], dict[str, float]]  # (shape, coefficients (k,)) -> the effect's own parameters
-    # Range of the first coefficient that makes physical sense; outside it is another effect.
-    first_coefficient: tuple[float, float] = (-math.inf, math.inf)
+    # Range of the first coefficients that makes physical sense; outside it is another effect.
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+    bounded: int = 1  # how many coefficients these are
     continuous: bool = True  # shapes between the grid's points make sense, so that a replay may refine them
     # The grid where it depends on the joint's size (a resonance, say); ``shapes`` where None.
     shapes_for: Callable[[Sequence[View]], tuple[Shape, ...]] | None = None
@@ -77,8 +78,9 @@ class InverseForm:
 
 def linear(
     columns: Mapping[str, Callable[[View], Array]],
-    first_coefficient: tuple[float, float] = (-math.inf, math.inf),
+    bounds: tuple[float, float] = (-math.inf, math.inf),
     *,
+    bounded: int = 1,
     of_speed: bool = False,
 ) -> InverseForm:
     """The form of an effect whose parameters enter linearly: by name, N m per unit of each along a view, (n,)."""
@@ -86,7 +88,8 @@ def linear(
         shapes=({},),
         regressors=lambda views, shape: [np.stack([column(v) for column in columns.values()], axis=1) for v in views],
         parameters=lambda shape, coefficients: dict(zip(columns, map(float, coefficients), strict=True)),
-        first_coefficient=first_coefficient,
+        bounds=bounds,
+        bounded=bounded,
         of_speed=of_speed,
     )
 
@@ -94,7 +97,7 @@ def linear(
 def shared(
     shapes: tuple[Shape, ...],
     column: Callable[[View, Shape], Array],
-    first_coefficient: tuple[float, float] = (0.0, math.inf),
+    bounds: tuple[float, float] = (0.0, math.inf),
     **more: Any,
 ) -> InverseForm:
     """The form of an effect of a ``share`` and a shape: N m per unit of the share along a view, (n,)."""
@@ -102,7 +105,7 @@ def shared(
         shapes=shapes,
         regressors=lambda views, shape: [column(v, shape)[:, None] for v in views],
         parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
-        first_coefficient=first_coefficient,
+        bounds=bounds,
         **more,
     )
 
@@ -120,7 +123,7 @@ def through_transmission(
         swings=True,
         regressors=regressors,
         parameters=lambda shape, coefficients: {**shape, scaled: shape[scaled] * max(0.05, float(coefficients[0]))},
-        first_coefficient=(0.2, 4.0),
+        bounds=(0.2, 4.0),
     )
 
 

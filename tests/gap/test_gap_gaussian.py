@@ -44,13 +44,15 @@ def test_a_set_of_columns_is_integrated_at_every_point(scale: float) -> None:
 def test_each_block_adds_what_it_adds_beside_those_that_are_held(held: tuple[int, ...]) -> None:
     gram, right, centre = problem(5, 1.0)
     at, starts, sizes = np.array(held, dtype=int), np.array([0, 2, 5]), np.array([1, 2, 4])
+    bounded = np.isin(np.arange(10), [0, 2, 3, 6])
     solved = np.linalg.solve(gram[np.ix_(at, at)] + np.eye(at.size), gram[at])
     reduced = right - solved.T @ (right[at] + centre[at])
-    gain, mean, variance = each_alone(gram, reduced, centre, starts, sizes, at, solved)
+    gain, mean, variance = each_alone(gram, reduced, centre, starts, sizes, bounded, at, solved)
     alone = dense(gram[np.ix_(at, at)], right[at], centre[at])[0]
     for k, (start, size) in enumerate(zip(starts, sizes, strict=True)):
         own = np.arange(start, start + size)
         both = np.concatenate([own, at])
         told, middle, covariance = dense(gram[np.ix_(both, both)], right[both], centre[both])
         assert gain[k] == pytest.approx(told - alone)
-        assert mean[k] == pytest.approx(middle[0]) and variance[k] == pytest.approx(covariance[0, 0])
+        assert mean[own] == pytest.approx(middle[:size])
+        assert variance[own] == pytest.approx(np.where(bounded[own], np.diag(covariance)[:size], 0.0))

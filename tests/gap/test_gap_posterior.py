@@ -72,6 +72,31 @@ def test_what_may_not_be_drawn_is_made_up_for_by_what_is_like_it() -> None:
     np.testing.assert_allclose(told, [-1.0, 3.0 - 0.9 * 2.0, 0.5])
 
 
+@pytest.mark.parametrize(("loss", "first"), [((0.3, 0.1), "directional_efficiency"), ((0.3, -0.26), "inertia_error")])
+def test_a_gear_returns_no_more_than_it_is_given(loss: tuple[float, float], first: str) -> None:
+    """An inertia a fifth off was a gear that lost a share of the load when driving, and gained it when driven back."""
+    random = np.random.default_rng(4)
+    time = np.linspace(0.0, 60.0, 1600)
+    load, motion = np.sin(2.0 * time), np.sign(np.sin(3.1 * time))
+    driving = load * motion >= 0.0
+    own = np.stack([motion * np.abs(load) * driving, motion * np.abs(load) * ~driving], axis=1)
+    columns = np.column_stack([own, load])
+    logs = [
+        Rows(name, judged, 0.0, own @ loss + 0.05 * random.standard_normal(1600), columns, np.zeros(1600), load < 9.0)
+        for name, judged in (("known", False), ("judged", True))
+    ]
+    form = all_effects()["directional_efficiency"].inverse
+    assert form is not None
+    gear = Term("directional_efficiency", {}, (0, 1), np.zeros(2), np.ones(2), *form.bounds, form.bounded)
+    inertia = Term("inertia_error", {}, (2,), np.zeros(1), np.ones(1))
+    posterior = Posterior(Channel("plant", 0.04, tuple(logs), (), (gear, inertia), 1.0, 10.0), 20)
+    told = findings([sampled(posterior)])[0]
+    assert told.effect == first and told.chance > 0.9
+    if first == gear.effect:
+        found = [told.parameters[name].value for name in ("driving_share", "backdriving_share")]
+        assert found == pytest.approx(loss, abs=0.02)
+
+
 @pytest.mark.parametrize("strength", [0.02, 30.0])
 def test_two_shapes_of_a_whole_cause_are_that_cause_once(strength: float) -> None:
     """Where the recordings hardly show it, too: told twice, it would be as large again in the validation logs."""

@@ -52,6 +52,7 @@ EFFECT = Effect(
             "driving_share": lambda v: v.slip * np.abs(v.load_nm) * (v.load_nm * v.slip >= 0.0),
             "backdriving_share": lambda v: v.slip * np.abs(v.load_nm) * ~(v.load_nm * v.slip >= 0.0),
         },
-        (0.0, math.inf),
+        (0.0, math.inf),  # no gear returns more than it is given
+        bounded=2,
     ),
 )

@@ -68,6 +68,6 @@ EFFECT = Effect(
             "linear_share": float(coefficients[0]),
             "quadratic_per_nm": float(coefficients[1]) if coefficients.size > 1 else 0.0,
         },
-        first_coefficient=(0.0, math.inf),
+        bounds=(0.0, math.inf),
     ),
 )

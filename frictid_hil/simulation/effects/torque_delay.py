@@ -97,7 +97,7 @@ EFFECT = Effect(
         # What a torque that acts up to one sample later than it is reported leaves in the plant, per sample.
         regressors=lambda views, shape: [v.step_s * np.gradient(v.torque_nm, v.step_s)[:, None] for v in views],
         parameters=lambda shape, coefficients: {"delay_s": max(0.0, float(coefficients[0])) * shape["sample_s"]},
-        first_coefficient=(0.1, 1.2),
+        bounds=(0.1, 1.2),
         continuous=False,
         # The sampling step: a longer delay shows in the reported torque itself.
         shapes_for=lambda views: ({"sample_s": views[0].step_s if views else 0.0},),
