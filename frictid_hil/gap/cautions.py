@@ -35,9 +35,11 @@ ALIKE_ONE_WAY = frozenset(
         "directional_efficiency",
         "load_dependent_friction",
         "gravity_error",
+        "torque_constant_error",
     )
 )
-"""Causes that a motion in one direction, or at one speed, cannot tell from one another: friction, bias and gravity."""
+"""Causes that a motion in one direction, or at one speed, cannot tell from one another: friction, bias, gravity, and
+the scale of the torque that holds all of them."""
 
 
 def one_sinusoid(experiments: ExperimentSet) -> bool:
