@@ -189,10 +189,11 @@ def once(function: Any, key: Callable[..., object] = lambda *told: len(told)) ->
     """A function that is asked once for each key, and answers the same ever after."""
     known: dict[object, Any] = {}
 
-    def same(*told: Any) -> Any:
-        if key(*told) not in known:
-            known[key(*told)] = function(*told)
-        return known[key(*told)]
+    def same(*told: Any, **named: Any) -> Any:
+        asked = key(*told), tuple(sorted(named.items()))
+        if asked not in known:
+            known[asked] = function(*told, **named)
+        return known[asked]
 
     return same
 
