@@ -122,10 +122,9 @@ def _causes(
             continue
         told = [t for t in known if t.effect == name and STIFFNESS not in t.shape]
         for term in told:
-            least, largest = form.bounds
             _, visible = effect_prior(name, {}, form.regressors(views, {}), scale, form.bounds)
             deviation = np.maximum(BEYOND * term.deviation, visible)
-            candidates.append(replace(term, deviation=deviation, least=least, largest=largest))
+            candidates.append(Term(name, term.shape, term.columns, term.mean, deviation, *form.bounds, form.bounded))
         for shape in () if told else form.grid_for(measured):
             columns = form.regressors(views, shape)
             mean, deviation = effect_prior(name, shape, columns, scale, form.bounds)

@@ -46,7 +46,7 @@ SURE = 5.0
 """Mean of a coefficient over its one-sigma, from which on its term is a whole model of its cause; a lag between two
 shapes may be shared by them."""
 UNNAMED = FAMILY + "rest"  # what a draw holds besides its terms
-FREE = (-math.inf, math.inf)
+FREE = (-math.inf, math.inf)  # bounds of a coefficient that has none
 POINTS = 4  # points of the grid, the likeliest, at which all candidates are compared
 
 
