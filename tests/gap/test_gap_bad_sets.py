@@ -108,6 +108,28 @@ def test_a_joint_that_rests_in_its_dead_band_is_not_refused() -> None:
     assert all(c.confidence < 0.9 for c in found.causes)
 
 
+def _following(hertz: float, late_s: float = 0.0, radians: float = 0.5, scale: float = 1.0) -> Experiment:
+    """A joint that follows its command late."""
+    time_s = 0.01 * np.arange(3000)
+    command = radians * (np.sin(2.0 * np.pi * hertz * time_s) + 0.2 * np.sin(time_s))
+    position = scale * np.interp(time_s - late_s, time_s, command)
+    return Experiment(f"{hertz:g} Hz", False, False, 0, time_s, position, position_command_rad=command)
+
+
+def test_a_fast_log_that_comes_late_is_not_taken_for_one_of_swapped_sign() -> None:
+    late = ExperimentSet("late", Nominal(), (_following(3.0, 0.15),))
+    assert checked(late) is late
+    with pytest.raises(InputFileError, match="opposite directions"):
+        checked(ExperimentSet("turned", Nominal(), (_following(0.2, scale=-1.0),)))
+
+
+def test_a_joint_may_rest_in_a_log_of_small_commands_but_not_in_all() -> None:
+    rests, follows = _following(1.0, radians=0.01, scale=0.01), _following(0.5, 0.05)
+    assert checked(ExperimentSet("play", Nominal(), (rests, follows))).experiments == (rests, follows)
+    with pytest.raises(InputFileError, match="times as far as its command"):
+        checked(ExperimentSet("degrees", Nominal(), (rests,)))
+
+
 def test_slow_motion_in_degrees_is_noticed_by_what_the_nominal_joint_asks_for() -> None:
     """Speeds that degrees do not give away: the torque does."""
     made = gap_sets.make(only=("triangle_slow", "breakaway"))
