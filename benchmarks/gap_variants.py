@@ -158,6 +158,32 @@ def _rigid(factor: float) -> Change:
     return change
 
 
+def _inertia(factor: float) -> Change:
+    """A rigid-body column whose inertia is another than the joint's: what of it goes with the joint's acceleration."""
+
+    def change(s: ExperimentSet) -> ExperimentSet | None:
+        if any(e.rigid_body_torque_nm is None for e in s.experiments):
+            return None
+        tables, accelerations = [], []
+        for e in s.experiments:
+            step, q = float(np.median(np.diff(e.time_s))), e.position_rad
+            low_pass = LowPass.at(1.0 / step)
+            accelerations.append(np.gradient(np.gradient(low_pass(q), step), step))
+            own = [accelerations[-1], np.cos(q), np.sin(q), np.ones_like(q), e.rigid_body_torque_nm]
+            tables.append(low_pass(np.stack(own, axis=1))[10:-10])
+        table = np.concatenate(tables)
+        inertia = float(np.linalg.lstsq(table[:, :-1], table[:, -1], rcond=None)[0][0])
+        if inertia <= 0.0:
+            return None
+        more = [(factor - 1.0) * inertia * a for a in accelerations]
+        pairs = zip(s.experiments, more, strict=True)
+        return replace(
+            s, experiments=tuple(replace(e, rigid_body_torque_nm=e.rigid_body_torque_nm + m) for e, m in pairs)
+        )
+
+    return change
+
+
 def _load(mass_share: float) -> Added:
     """A payload at the end of the link: gravity and inertia of a size that the joint's torque knows."""
 
@@ -235,7 +261,8 @@ VARIANTS: dict[str, Variant] = {
         )
         for f in (0.92, 1.04, 1.08, 1.15)
     },
-    **{f"rigid body x {f:g}": Variant(_rigid(f), ("torque_constant_error",)) for f in (0.9, 1.1, 1.2)},
+    **{f"rigid body x {f:g}": Variant(_rigid(f), LOADS) for f in (0.9, 1.1, 1.2)},
+    **{f"inertia believed x {f:g}": Variant(_inertia(f), ("inertia_error",)) for f in (0.5, 2.0)},
     "a payload": Variant(_torque(_load(0.5)), LOADS),
     "a payload in judged logs": Variant(_torque(_load(0.5), lambda e: e.validation), None),
     "pushes": Variant(_torque(_pushed), None),

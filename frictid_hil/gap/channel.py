@@ -103,6 +103,14 @@ class Builder:
         return tuple(range(first, self.width))
 
 
+def taken(blocks: Sequence[Array], numbers: Sequence[int], rows: int | None = None) -> Array:
+    """Some columns of blocks that stand side by side, their first rows or all."""
+    ends = np.cumsum([block.shape[1] for block in blocks])
+    homes = [int(np.searchsorted(ends, number, side="right")) for number in numbers]
+    first = ends - [block.shape[1] for block in blocks]
+    return np.stack([blocks[h][:rows, n - first[h]] for n, h in zip(numbers, homes, strict=True)], axis=1)
+
+
 def rows_of(
     recording: Recording,
     columns: Sequence[Array],

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.channel import STIFFNESS, Builder, Term
+from frictid_hil.gap.channel import STIFFNESS, Builder, Term, taken
 from frictid_hil.gap.experiment_set import Nominal
-from frictid_hil.gap.residuals import Recording, friction_scales, presliding_state
+from frictid_hil.gap.residuals import LowPass, Recording, friction_scales, presliding_state
 from frictid_hil.gap.tolerances import Sigma
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import View
@@ -19,6 +20,9 @@ FREE = 10.0  # one-sigma of a share that was fitted to these very logs: nothing 
 SAME_RATE = 0.05  # rows and control ticks are the same where their rates differ by no more than this share
 ANYWHERE = 0.3  # one-sigma of a moment that is known to lie in a row, over the row: evenly spread, 1/sqrt(12)
 STIFFER = 0.1  # step of the presliding stiffness by which its derivative is formed
+IN_COLUMN = ("inertia_error", "gravity_error")  # what a rigid-body column may be wrong by
+ON_AND_ON_RAD = 4.0 * math.pi  # travel of a joint that turns on and on, as no arm does
+LEVEL = "about its level"  # shape of an error of gravity whose level is an offset
 ROUNDING = 1e-9  # share of a level that rounding may leave of it
 _ESTIMATED = {
     "inertia_error": "inertia",
@@ -36,20 +40,64 @@ def nuisances(
     ``estimated`` holds ``inertia`` and ``friction`` where they were fitted to these logs.
     """
     terms = []
-    for name, deviation in _one_sigma(nominal).items():
+    sigmas, held = _one_sigma(nominal), held_by_column(nominal, views, logs)
+    if held is not None:
+        sigmas |= dict.fromkeys(IN_COLUMN, nominal.tolerances.rigid_body_torque.relative)
+    for name, deviation in sigmas.items():
         form = all_effects()[name].inverse
         assert form is not None
-        columns = form.regressors(views, {})
+        columns = form.regressors(views if held is None or name not in IN_COLUMN else held, {})
         if not any(float(np.max(np.abs(c))) > 0.0 for c in columns):
             continue
         free = _ESTIMATED.get(name) in estimated
         terms.append(_term("" if free else name, builder.add(columns), FREE if free else deviation))
     terms += _timing(nominal, views, builder)
+    if held is not None:
+        terms += _about_its_level(terms, builder)
     terms += _friction_shape(nominal, views, builder)
-    own = [r.experiment.rigid_body_torque_nm for r in logs if r.experiment.rigid_body_torque_nm is not None]
-    if len(own) == len(logs):
-        terms.append(_term("", builder.add([o[:, None] for o in own]), nominal.tolerances.rigid_body_torque.relative))
+    if held is None and all(r.experiment.rigid_body_torque_nm is not None for r in logs):
+        whole = builder.add([v.load_nm[:, None] for v in views])
+        terms.append(_term("", whole, nominal.tolerances.rigid_body_torque.relative))
     return terms
+
+
+def held_by_column(nominal: Nominal, views: Sequence[View], logs: Sequence[Recording]) -> list[View] | None:
+    """The views with the inertia and the gravity that a rigid-body column holds; None where the file states its own.
+
+    What of the column goes with the joint's own acceleration is its inertia, the rest its gravity: that of a joint that
+    turns on and on over its own angle alone. A part within the column's tolerance is how it was formed.
+    """
+    if nominal.inertia_kg_m2 or any(r.experiment.rigid_body_torque_nm is None for r in logs):
+        return None
+    low_pass = LowPass.at(1.0 / views[0].step_s)
+    own = [np.stack([v.acceleration_rad_s2, *over_angle(v), v.load_nm], axis=1) for v in views]
+    table = np.concatenate([low_pass(part)[5:-5] for part in own])
+    weights = np.linalg.lstsq(table[:, :-1], table[:, -1], rcond=None)[0]
+    least_nm = nominal.tolerances.rigid_body_torque.relative * float(np.std(table[:, -1]))
+    told = weights[0] > 0.0 and float(np.std(weights[0] * table[:, 0])) > least_nm
+    inertia = float(weights[0]) if told else 0.0
+    if max(float(np.ptp(v.position_rad)) for v in views) > ON_AND_ON_RAD:
+        rests = [part[:, 1:-1] @ weights[1:] for part in own]
+    else:  # Gravity changes with the posture: what is faster is how the column was differentiated.
+        rests = [low_pass(v.load_nm - inertia * v.acceleration_rad_s2) for v in views]
+    share = 1.0 if float(np.std(np.concatenate(rests))) > least_nm else 0.0
+    parts = zip(views, rests, strict=True)
+    return [replace(v, link_inertia_kg_m2=inertia, gravity_nm=share * rest) for v, rest in parts]
+
+
+def over_angle(view: View) -> tuple[Array, Array, Array]:
+    """Gravity over the joint's own angle, and a level, per N m."""
+    return np.cos(view.position_rad), np.sin(view.position_rad), np.ones_like(view.slip)
+
+
+def _about_its_level(terms: Sequence[Term], builder: Builder) -> list[Term]:
+    """An error of a column's gravity beside an offset that was fitted with the column: that holds gravity's level."""
+    gravity = next((t for t in terms if t.effect == "gravity_error"), None)
+    if gravity is None:
+        return []
+    rests = [taken(part, gravity.columns) for part in builder.parts]
+    level = np.mean(np.concatenate(rests))
+    return [replace(gravity, shape={LEVEL: 1.0}, columns=builder.add([rest - level for rest in rests]))]
 
 
 def _term(effect: str, columns: tuple[int, ...], deviation: float) -> Term:

@@ -10,7 +10,18 @@ import numpy as np
 
 from frictid_hil.config.nominal import ReportFilter
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.channel import FAMILY, STIFFNESS, Builder, Channel, Rows, Term, effect_prior, of_each_log, rows_of
+from frictid_hil.gap.channel import (
+    FAMILY,
+    STIFFNESS,
+    Builder,
+    Channel,
+    Rows,
+    Term,
+    effect_prior,
+    of_each_log,
+    rows_of,
+    taken,
+)
 from frictid_hil.gap.experiment_set import Nominal
 from frictid_hil.gap.generic import WHOLE, families
 from frictid_hil.gap.noise import LOCAL_S
@@ -122,7 +133,8 @@ def _causes(
             continue
         told = [t for t in known if t.effect == name and STIFFNESS not in t.shape]
         for term in told:
-            _, visible = effect_prior(name, {}, form.regressors(views, {}), scale, form.bounds)
+            columns = [taken(part, term.columns) for part in builder.parts]
+            _, visible = effect_prior(name, {}, columns, scale, form.bounds)
             deviation = np.maximum(BEYOND * term.deviation, visible)
             candidates.append(Term(name, term.shape, term.columns, term.mean, deviation, *form.bounds, form.bounded))
         for shape in () if told else form.grid_for(measured):
@@ -218,7 +230,7 @@ def band(
     lines = [t for t in candidates if not t.effect.startswith(FAMILY) and is_line(t.effect)]
     if len(usable) == 1 or not lines:
         return LowPass(rate, usable[0])
-    tables = [[_taken(part, t.columns) for part in parts] for t in lines]
+    tables = [[taken(part, t.columns, LINE_ROWS) for part in parts] for t in lines]
     worth = [h for h in usable if max(_described(residuals, table, LowPass(rate, h)) for table in tables) > LINE_SHARE]
     return LowPass(rate, next((h for h in usable if not worth or h > worth[-1]), usable[-1]))
 
@@ -229,14 +241,6 @@ def is_line(effect: str) -> bool:
     return (
         form is not None and form.shapes_for is not None and Region.POSITION in all_effects()[effect].signature.regions
     )
-
-
-def _taken(blocks: Sequence[Array], numbers: Sequence[int]) -> Array:
-    """Some columns of blocks that stand side by side, their first rows."""
-    ends = np.cumsum([block.shape[1] for block in blocks])
-    homes = [int(np.searchsorted(ends, number, side="right")) for number in numbers]
-    first = ends - [block.shape[1] for block in blocks]
-    return np.stack([blocks[h][:LINE_ROWS, n - first[h]] for n, h in zip(numbers, homes, strict=True)], axis=1)
 
 
 def _described(residuals: Sequence[Array], tables: Sequence[Array], low_pass: LowPass) -> float:

@@ -62,6 +62,32 @@ def test_rigid_body_torque_from_elsewhere(asymmetric: ExperimentSet) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("inertia", "gravity", "cause", "share"),
+    [(0.2, 4.0, "inertia_error", 1.0), (0.4, 6.0, "gravity_error", -1.0 / 3.0)],
+)
+def test_a_rigid_body_column_is_wrong_by_its_inertia_or_its_gravity(
+    inertia: float, gravity: float, cause: str, share: float
+) -> None:
+    """An inertia believed half as large beside a column was a torque constant that is 40 % off, with 0.99."""
+
+    def given_rigid(e: Experiment) -> Experiment:
+        q, torque = e.position_rad, e.torque_nm
+        assert torque is not None
+        acceleration = np.zeros_like(q)
+        acceleration[1:-1] = np.diff(q, 2) / gap_sets.STEP_S**2
+        own = np.append(0.5 * (torque[1:] + torque[:-1]), torque[-1])  # a column goes with the torque of its own row
+        return replace(e, torque_nm=own, rigid_body_torque_nm=inertia * acceleration + gravity * np.cos(q))
+
+    light = gap_sets.make(only=("sines_small", "sines_large", "triangle_slow", "chirp", "sines_repeat"))
+    nominal = Nominal(curve=gap_sets.NOMINAL.curve, presliding_stiffness_nm_per_rad=20000.0)
+    d = diagnose(replace(_each(light, given_rigid), nominal=nominal))
+    assert d.verdict == "explained" and d.causes[0].effect == cause
+    told = d.causes[0].parameters["error_share"]
+    assert told.low is not None and told.high is not None and told.low < share < told.high
+
+
+@pytest.mark.slow
 def test_one_log_alone_is_never_sure(asymmetric: ExperimentSet) -> None:
     one = replace(asymmetric, experiments=asymmetric.experiments[:1])
     d = diagnose(replace(one, nominal=replace(one.nominal, controller=None)))
