@@ -177,11 +177,13 @@ def _inertia(factor: float) -> Change:
             return None
         more = [(factor - 1.0) * inertia * a for a in accelerations]
         pairs = zip(s.experiments, more, strict=True)
-        return replace(
-            s, experiments=tuple(replace(e, rigid_body_torque_nm=e.rigid_body_torque_nm + m) for e, m in pairs)
-        )
+        return replace(s, experiments=tuple(_with_rigid(e, m) for e, m in pairs))
 
     return change
+
+
+def _with_rigid(e: Experiment, more_nm: Array) -> Experiment:
+    return columns(e, lambda name, column: column + more_nm if name == "rigid_body_torque_nm" else column)
 
 
 def _load(mass_share: float) -> Added:
