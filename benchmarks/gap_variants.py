@@ -166,6 +166,7 @@ def _inertia(factor: float) -> Change:
             return None
         tables, accelerations = [], []
         for e in s.experiments:
+            assert e.rigid_body_torque_nm is not None
             step, q = float(np.median(np.diff(e.time_s))), e.position_rad
             low_pass = LowPass.at(1.0 / step)
             accelerations.append(np.gradient(np.gradient(low_pass(q), step), step))
