@@ -76,13 +76,18 @@ def held_by_column(nominal: Nominal, views: Sequence[View], logs: Sequence[Recor
     least_nm = nominal.tolerances.rigid_body_torque.relative * float(np.std(table[:, -1]))
     told = weights[0] > 0.0 and float(np.std(weights[0] * table[:, 0])) > least_nm
     inertia = float(weights[0]) if told else 0.0
+    accelerations = [v.acceleration_rad_s2 for v in views]
     if max(float(np.ptp(v.position_rad)) for v in views) > ON_AND_ON_RAD:
         rests = [part[:, 1:-1] @ weights[1:] for part in own]
+        # What is faster than its motion is what lines over position do to its speed.
+        accelerations = [low_pass(acceleration) for acceleration in accelerations]
     else:  # Gravity changes with the posture: what is faster is how the column was differentiated.
         rests = [low_pass(v.load_nm - inertia * v.acceleration_rad_s2) for v in views]
     share = 1.0 if float(np.std(np.concatenate(rests))) > least_nm else 0.0
-    parts = zip(views, rests, strict=True)
-    return [replace(v, link_inertia_kg_m2=inertia, gravity_nm=share * rest) for v, rest in parts]
+    return [
+        replace(v, link_inertia_kg_m2=inertia, acceleration_rad_s2=acceleration, gravity_nm=share * rest)
+        for v, acceleration, rest in zip(views, accelerations, rests, strict=True)
+    ]
 
 
 def over_angle(view: View) -> tuple[Array, Array, Array]:

@@ -45,5 +45,6 @@ EFFECT = Effect(
             26.0,
         ),
     ),
+    rigid=True,
     inverse=linear({"bias_nm": lambda v: np.ones_like(v.position_rad)}),
 )
