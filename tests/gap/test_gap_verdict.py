@@ -12,7 +12,7 @@ import pytest
 from frictid_hil.gap.channel import Term
 from frictid_hil.gap.findings import DRAWS, SIDED, Finding, Sampled, findings
 from frictid_hil.gap.how_far import Closed
-from frictid_hil.gap.verdict import _shown, verdict
+from frictid_hil.gap.verdict import _shown, unreached, verdict
 
 CAUSE = "torque_saturation"
 ERROR = "gravity_error"
@@ -110,6 +110,20 @@ def test_a_sure_cause_within_noise_is_told_if_it_takes_half_of_the_gap(after: fl
     drawn = channel("plant", CAUSE, 0.95, np.ones(DRAWS))
     gap = Closed("plant", 1.99, after, after, after, floor=1.0)
     assert verdict([sure(0.95)], [drawn], [gap], NEGLIGIBLE, otherwise_quiet=True).word == word
+
+
+@pytest.mark.parametrize(("reaches", "word"), [(False, "explained"), (True, "none")])
+def test_a_cause_that_the_validation_logs_never_come_to_is_told_all_the_same(reaches: bool, word: str) -> None:
+    """A saturation of 19 floors, which only a fast log came to, was no help on slow ones."""
+    drawn = channel("plant", CAUSE, 8.8, np.ones(DRAWS))
+    told = [SimpleNamespace(x=np.full((50, 1), 1.0), validation=False)]
+    told += [SimpleNamespace(x=np.full((50, 1), float(reaches)), validation=True)]
+    channel_with: Any = SimpleNamespace(**{**vars(drawn.posterior.channel), "logs": told})
+    posterior: Any = SimpleNamespace(**{**vars(drawn.posterior), "channel": channel_with})
+    drawn = replace(drawn, posterior=posterior)
+    assert unreached(sure(8.8), [drawn]) is not reaches
+    gap = Closed("plant", 1.1, 1.1, 1.0, 1.2, floor=1.0)
+    assert verdict([sure(8.8)], [drawn], [gap], NEGLIGIBLE, otherwise_quiet=True).word == word
 
 
 @pytest.mark.parametrize("above", [0.5, 0.7, 0.8, 0.2, 1.0])
