@@ -24,6 +24,8 @@ SLOWEST_STEP_S = 0.2  # sampling steps longer than this are more likely in milli
 OTHER_UNIT = 20.0
 """Factor between what a nominal joint or its controller asks for and what was measured that no joint explains."""
 LATEST_COMMAND_S = 0.5  # longest time by which a joint may follow its command late
+FOLLOWS = 0.5  # correlation of a position with its command from which on it follows
+LAGS = 51  # times that are tried
 ONE_WAY = 0.03  # part of its way that a joint must go back to move in both directions
 LONGEST_HALT = 0.25  # part of a log in which a position may repeat itself far from its command
 
@@ -45,7 +47,7 @@ def checked(experiments: ExperimentSet) -> ExperimentSet:
             cause="the sign of torque or position is swapped",
             next_step="turn the sign of one of the columns",
         )
-    _check_travel(experiments)
+    _check_commands(experiments)
     _check_scale(experiments)
     return experiments
 
@@ -116,8 +118,6 @@ def _check_velocity(e: Experiment, velocity_rad_s: Array) -> None:
 
 
 def _check_command(e: Experiment, command: Array) -> None:
-    if _turned(command, e):
-        raise InputFileError("position and command move in opposite directions", where=e.name, cause="a swapped sign")
     start, rows = _longest_halt(e.position_rad)
     inside = slice(start, start + rows)
     error = np.abs(command - e.position_rad)
@@ -135,29 +135,40 @@ def _check_command(e: Experiment, command: Array) -> None:
         )
 
 
-def _turned(command: Array, e: Experiment) -> bool:
-    """Whether a position moves against its command, and is not one that follows a fast command late."""
+def _check_commands(experiments: ExperimentSet) -> None:
+    """Commands are in the position's unit and direction.
+
+    A joint may rest while a small command travels, and follow a fast one so late that the two seem to part; the other
+    logs tell which it is.
+    """
+    logs = [(e, e.position_command_rad) for e in experiments.experiments if e.position_command_rad is not None]
+    travels = [float(np.ptp(e.position_rad)) for e, _ in logs]
+    together = [_correlation(command, e.position_rad) for e, command in logs]
+    for (e, command), travel, follows in zip(logs, travels, together, strict=True):
+        asked = float(np.ptp(command))
+        rests = travel < asked / OTHER_UNIT and asked <= max(travels)
+        if not rests and not 1.0 / OTHER_UNIT < travel / asked < OTHER_UNIT:
+            raise InputFileError(
+                f"the position travels {travel / asked:.3g} times as far as its command",
+                where=e.name,
+                cause="one of the two is probably in degrees or in counts",
+            )
+        if follows < -FOLLOWS and not (max(together) > FOLLOWS and _follows_late(command, e)):
+            raise InputFileError(
+                "position and command move in opposite directions", where=e.name, cause="a swapped sign"
+            )
+
+
+def _follows_late(command: Array, e: Experiment) -> bool:
+    """Whether a position follows its command by any of several times."""
     latest = min(round(LATEST_COMMAND_S / e.step_s), command.size // 2)
-    follows = [_correlation(command[: command.size - late], e.position_rad[late:]) for late in range(latest + 1)]
-    return follows[0] < -0.5 and max(follows) < 0.5
+    lags = np.unique(np.linspace(0, latest, LAGS).round().astype(int))
+    return max(_correlation(command[: command.size - late], e.position_rad[late:]) for late in lags) > FOLLOWS
 
 
 def _correlation(one: Array, other: Array) -> float:
     spread = float(np.std(one) * np.std(other))
     return float(np.mean((one - np.mean(one)) * (other - np.mean(other)))) / spread if spread > 0.0 else 0.0
-
-
-def _check_travel(experiments: ExperimentSet) -> None:
-    """A joint may rest while a small command travels, but not in every log."""
-    logs = [e for e in experiments.experiments if e.position_command_rad is not None]
-    ratios = {e.name: float(np.ptp(e.position_rad)) / float(np.ptp(e.position_command_rad)) for e in logs}  # type: ignore[arg-type]
-    for name, ratio in ratios.items():
-        if ratio > OTHER_UNIT or max(ratios.values()) < 1.0 / OTHER_UNIT:
-            raise InputFileError(
-                f"the position travels {ratio:.3g} times as far as its command",
-                where=name,
-                cause="one of the two is probably in degrees or in counts",
-            )
 
 
 def _longest_halt(position_rad: Array) -> tuple[int, int]:

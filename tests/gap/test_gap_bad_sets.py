@@ -117,17 +117,28 @@ def _following(hertz: float, late_s: float = 0.0, radians: float = 0.5, scale: f
 
 
 def test_a_fast_log_that_comes_late_is_not_taken_for_one_of_swapped_sign() -> None:
-    late = ExperimentSet("late", Nominal(), (_following(3.0, 0.15),))
+    fast, slow = _following(3.0, 0.15), _following(0.2, 0.15)
+    late = ExperimentSet("late", Nominal(), (fast, slow))
     assert checked(late) is late
+    for logs in ((fast,), (_following(0.2, scale=-1.0), slow), (_following(0.2, scale=-1.0),)):
+        with pytest.raises(InputFileError, match="opposite directions"):
+            checked(ExperimentSet("turned", Nominal(), logs))
+
+
+@pytest.mark.parametrize("hertz", [0.2, 0.8, 1.0, 3.0])
+def test_a_swapped_sign_is_noticed_at_any_frequency(hertz: float) -> None:
+    turned = (_following(hertz, scale=-1.0), _following(0.7 * hertz, scale=-1.0))
     with pytest.raises(InputFileError, match="opposite directions"):
-        checked(ExperimentSet("turned", Nominal(), (_following(0.2, scale=-1.0),)))
+        checked(ExperimentSet("turned", Nominal(), turned))
 
 
-def test_a_joint_may_rest_in_a_log_of_small_commands_but_not_in_all() -> None:
+def test_a_joint_may_rest_while_a_small_command_travels() -> None:
     rests, follows = _following(1.0, radians=0.01, scale=0.01), _following(0.5, 0.05)
     assert checked(ExperimentSet("play", Nominal(), (rests, follows))).experiments == (rests, follows)
-    with pytest.raises(InputFileError, match="times as far as its command"):
-        checked(ExperimentSet("degrees", Nominal(), (rests,)))
+    degrees = _following(0.5, radians=57.3, scale=1.0 / 57.3)
+    for logs in ((degrees, follows), (rests,)):
+        with pytest.raises(InputFileError, match="times as far as its command"):
+            checked(ExperimentSet("a log in degrees", Nominal(), logs))
 
 
 def test_slow_motion_in_degrees_is_noticed_by_what_the_nominal_joint_asks_for() -> None:

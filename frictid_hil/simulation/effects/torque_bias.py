@@ -45,6 +45,5 @@ EFFECT = Effect(
             26.0,
         ),
     ),
-    rigid=True,
     inverse=linear({"bias_nm": lambda v: np.ones_like(v.position_rad)}),
 )
