@@ -3,8 +3,9 @@
 Run: OMP_NUM_THREADS=1 python benchmarks/gap_time.py [--every 1] [--repeats 3] [--json]
 
 The practice joints below ``FRICTID_GAP_PRACTICE`` (``../shared/data`` beside the repository unless given). Whole joints
-are those of the narrow world, eight experiments each, and of the wide one. A single log is one experiment of sines of
-the former, or the first log that a user of the latter recorded his own way, diagnosed as if there were no other.
+are those of the narrow world, eight experiments each, and of the wide one. A single log is the experiment
+``sines_large`` of a narrow joint, or the first log of a wide joint that was recorded in a user's own way; it is
+diagnosed as if there were no other.
 Seconds are of the process, so that other work beside it counts little; each joint is answered ``--repeats`` times, one
 round after the other, and the spread is that of the rounds' medians. The first answer, which compiles, is not counted.
 """
@@ -23,7 +24,7 @@ from pathlib import Path
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import ExperimentSet
 
-ASKED_S = {"whole": 5.0, "single": 2.0}  # median seconds a joint that is promised at most
+ASKED_S = {"whole": 5.0, "single": 2.0}  # median seconds a joint that docs/evidence/gap-check.md asks for
 SINES, OWN = "sines_large", "excitation"  # an experiment of the procedure, and a log of a user's own
 
 
@@ -75,6 +76,8 @@ def main() -> None:
             needed = SINES if chosen is sines_alone else OWN
             whole = [joint for joint in whole if any(e.name == needed for e in joint.experiments)]
         joints = [chosen(joint) for joint in whole]
+        if not joints:
+            parser.error(f"no joint to diagnose in {practice() / folder}")
         diagnose(joints[0])
         rounds = [seconds(joints) for _ in range(options.repeats)]
         found[kind] = {

@@ -148,7 +148,7 @@ def _level(share: float) -> Change:
 
 
 def _rigid(factor: float) -> Change:
-    """A rigid-body column from another torque constant than the drive's; friction is as it was fitted."""
+    """A rigid-body column that is off as a whole: by a torque constant, or by inertia and gravity alike."""
 
     def change(s: ExperimentSet) -> ExperimentSet | None:
         if any(e.rigid_body_torque_nm is None for e in s.experiments):

@@ -24,6 +24,7 @@ ONE_SINUSOID = (
 ALIKE_ON_A_SINUSOID = {"presliding_hysteresis": "torque_delay", "torque_delay": "presliding_hysteresis"}
 """Causes that such a motion cannot tell from each other."""
 
+SAME_ONE_WAY = ("direction_asymmetry",)  # a friction level and a viscosity, where a joint moves one way
 ALIKE_ONE_WAY = frozenset(
     (
         "torque_bias",
@@ -31,7 +32,6 @@ ALIKE_ONE_WAY = frozenset(
         "viscous_error",
         "viscous_nonlinearity",
         "stribeck",
-        "direction_asymmetry",
         "directional_efficiency",
         "load_dependent_friction",
         "gravity_error",

@@ -20,6 +20,7 @@ from frictid_hil.gap.diagnosis import NextExperiment
 from frictid_hil.gap.experiment_set import Experiment, Nominal
 from frictid_hil.gap.experiments import Envelope, catalogue, plan_document
 from frictid_hil.gap.findings import Sampled
+from frictid_hil.gap.nuisances import IN_COLUMN
 from frictid_hil.gap.posterior import Known
 from frictid_hil.gap.residuals import LowPass, Recording, nominal_torque, view_of
 from frictid_hil.simulation.effects import all_effects
@@ -54,7 +55,9 @@ def next_experiment(
     ``plant`` holds draws of the plant channel; None where no log has a torque.
     """
     recorded = {log.experiment.name for log in logs}
-    found = [] if plant is None else expected(first, second, nominal, logs, plant)
+    # A planned motion has no rigid-body column yet, so that it tells nothing of what the column holds.
+    in_column = nominal.inertia_kg_m2 is None and {first, second} & set(IN_COLUMN)
+    found = [] if plant is None or in_column else expected(first, second, nominal, logs, plant)
     fresh = [one for one in found if one.name not in recorded and one.evidence_nats > TELLS_NATS]
     if not fresh:
         return _named_by_effects(first, second, recorded)

@@ -25,7 +25,7 @@ from frictid_hil.gap.channel import (
 from frictid_hil.gap.experiment_set import Nominal
 from frictid_hil.gap.generic import WHOLE, families
 from frictid_hil.gap.noise import LOCAL_S
-from frictid_hil.gap.nuisances import bent_rate_nm, nuisances
+from frictid_hil.gap.nuisances import about_its_level, bent_rate_nm, nuisances
 from frictid_hil.gap.position_noise import differenced_rms, quiet_views, white_rms
 from frictid_hil.gap.residuals import LowPass, Recording, first_slide, reported, rms
 from frictid_hil.simulation.effect import Region
@@ -110,6 +110,8 @@ def terms_of(
         numbers = builder.add(bent_nm)
         errors = [t for t in candidates if t.effect == "viscous_error"]
         candidates += [replace(t, shape={BENT: 1.0}, columns=numbers) for t in errors]
+    if all(r.experiment.rigid_body_torque_nm is not None for r in logs):
+        candidates += about_its_level(candidates, builder)
     generic = families(views)
     if sum(not r.experiment.validation for r in logs) >= SEVERAL:
         generic[EACH_LOG] = of_each_log([np.stack([np.ones_like(v.slip), v.slip], axis=1) for v in views])

@@ -69,7 +69,7 @@ def test_rigid_body_torque_from_elsewhere(asymmetric: ExperimentSet) -> None:
 def test_a_rigid_body_column_is_wrong_by_its_inertia_or_its_gravity(
     inertia: float, gravity: float, cause: str, share: float
 ) -> None:
-    """An inertia believed half as large beside a column was a torque constant that is 40 % off, with 0.99."""
+    """Beside a column neither could be named: a torque constant, a ripple and a friction level stood in for both."""
 
     def given_rigid(e: Experiment) -> Experiment:
         q, torque = e.position_rad, e.torque_nm
@@ -84,7 +84,7 @@ def test_a_rigid_body_column_is_wrong_by_its_inertia_or_its_gravity(
     d = diagnose(replace(_each(light, given_rigid), nominal=nominal))
     assert d.verdict == "explained" and d.causes[0].effect == cause
     told = d.causes[0].parameters["error_share"]
-    assert told.low is not None and told.high is not None and told.low < share < told.high
+    assert told.low is not None and told.high is not None and told.low < share < told.high < told.low + 0.2
 
 
 @pytest.mark.slow
