@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Finding, told_numbers
 from frictid_hil.gap.forward import Effects
-from frictid_hil.gap.verdict import DOUBTED, FLOORS, HALF, READ_DIRECTLY, REMAINS, Verdict, swings
+from frictid_hil.gap.verdict import DOUBTED, FLOORS, HALF, READ_DIRECTLY, REMAINS, SHOWS, Verdict, swings
 from frictid_hil.simulation.effects import all_effects
 
 FACTORS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
@@ -164,7 +164,8 @@ def _instead_of(cause: Finding, falls: Sequence[Finding]) -> Finding:
 
 def _closes(said: Verdict, kept: Collection[str], gap_nm: float, loop: Loop) -> bool:
     """Whether these causes close the loop, and what has no name is not between demand and torque: that is seen."""
-    return bool(kept) and not _stays(_may_stay(kept), gap_nm, loop) and not said.place.startswith("actuation")
+    closed = gap_nm <= SHOWS * loop.floor_nm or not _stays(_may_stay(kept), gap_nm, loop)
+    return bool(kept) and closed and not said.place.startswith("actuation")
 
 
 def _may_stay(kept: Collection[str]) -> float:

@@ -249,6 +249,15 @@ def test_what_has_no_name_along_the_motion_is_no_gap_where_the_causes_close_the_
         assert borne.idle == {"gravity_error"}
 
 
+@pytest.mark.parametrize(("left_nm", "word"), [(0.68, "explained"), (0.8, "unknown")])
+def test_a_loop_closes_where_what_stays_is_no_louder_than_its_noise(left_nm: float, word: str) -> None:
+    """Play of 1.9 floors was `unknown`: it left an eighth of a gap that is hardly a floor beside the noise."""
+    named = (cause("inertia_error"), cause("backlash", gap_rad=1e-3))
+    gaps = {"backlash": left_nm, "inertia_error": 1.4, "backlash+inertia_error": 1.5}
+    said, _ = answer(Verdict("explained", named), loop(gaps, floor_nm=0.5))
+    assert said.word == word and said.named[0].effect == "backlash"
+
+
 @pytest.mark.parametrize(
     ("place", "word"), [("plant: time", "explained"), ("actuation: a cause that comes and goes", "unknown")]
 )
