@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from frictid_hil.gap.borne_out import BorneOut, Loop, borne_out
-from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, SAME_ONE_WAY, below_first_pair
+from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, below_first_pair
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.findings import Finding, numbers, told_numbers
@@ -61,8 +61,6 @@ def diagnose(
     """
     allowed = tuple(n for n in all_effects() if library is None or n in library)
     joint = prepared(experiments, allowed)
-    if "motion" in joint.reasons:
-        allowed = tuple(name for name in allowed if name not in SAME_ONE_WAY)
     along = along_the_motion(joint, allowed)
     best = _answer(joint, in_the_better_way(joint, along), negligible)
     if best.verdict == "none" or not _leaves(best, REMAINS):

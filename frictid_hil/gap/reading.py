@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replayed
+from frictid_hil.gap.cautions import SAME_ONE_WAY
 from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.drive_in_loop import as_late
@@ -59,6 +60,8 @@ def along_the_motion(joint: Prepared, allowed: Sequence[str]) -> Reading:
 
     Noise of a wide band may hide what moves slowly.
     """
+    if "motion" in joint.reasons:
+        allowed = [name for name in allowed if name not in SAME_ONE_WAY]
     reasons = dict(joint.reasons)
     channels = [sampled(Posterior(c, len(allowed))) for c in _channels(joint, allowed, reasons)]
     reading = Reading(allowed, channels, *_read(channels, joint, allowed), reasons)
