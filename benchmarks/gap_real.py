@@ -100,9 +100,9 @@ def double_pendulum(folder: Path, prefix: str, joint: int, odd_judged: bool) -> 
 
     The published parameters are of design A.0 and of no use for C.1, whose links are others; so both are identified.
     """
-    logs = [_swing(path) for path in sorted((folder / "double_pendulum").glob(f"{prefix}_*.csv.gz"))]
+    logs = swings(folder, prefix)
     judged = [(order % 2 == 1) == odd_judged for order in range(len(logs))]
-    parts = [_two_link(log, joint) for log in logs]
+    parts = [two_link(log, joint) for log in logs]
     known = [k for k, unseen in enumerate(judged) if not unseen]
     columns = np.concatenate([_filtered(_with_friction(parts[k], logs[k], joint), logs[k]) for k in known])
     torque = np.concatenate([_filtered(logs[k].torque_nm[joint - 1][:, None], logs[k])[:, 0] for k in known])
@@ -124,6 +124,11 @@ def double_pendulum(folder: Path, prefix: str, joint: int, odd_judged: bool) -> 
     return ExperimentSet(f"double_pendulum {prefix} joint {joint}", Nominal(), tuple(experiments))
 
 
+def swings(folder: Path, prefix: str) -> list[_Swing]:
+    """All logs of one design of the double pendulum."""
+    return [_swing(path) for path in sorted((folder / "double_pendulum").glob(f"{prefix}_*.csv.gz"))]
+
+
 def _swing(path: Path) -> _Swing:
     with gzip.open(path, "rt") as file:
         names = file.readline().strip().split(",")
@@ -138,7 +143,7 @@ def _swing(path: Path) -> _Swing:
     return _Swing(path.name.removesuffix(".csv.gz"), even, (position[0], position[1]), (torque[0], torque[1]))
 
 
-def _two_link(log: _Swing, joint: int) -> np.ndarray:
+def two_link(log: _Swing, joint: int) -> np.ndarray:
     """Columns of the two-link model, linear in its five base parameters (angle 0 hanging down), shape (n, 5).
 
     The encoder's step of 0.38 mrad makes noise of 1 rad/s2 at 20 Hz: positions pass 8 Hz before they are

@@ -20,7 +20,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from gap_real import Known, cases, diagnosed, real_data
+from gap_real import Known, cases, diagnosed, real_data, swings, two_link
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Diagnosis
@@ -28,6 +28,7 @@ from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
 from frictid_hil.gap.residuals import LowPass, recordings, rms
 from frictid_hil.gap.sanity import completed
 
+LINKS_M = (0.3, 0.2)  # lengths of the double pendulum's links
 PLAIN = 2.0
 """Size of what is added over the gap that was there, from which on it must be named."""
 SURE, FALSE_CLEAR = 0.9, 3.0
@@ -178,13 +179,13 @@ def _inertia(factor: float) -> Change:
             return None
         more = [(factor - 1.0) * inertia * a for a in accelerations]
         pairs = zip(s.experiments, more, strict=True)
-        return replace(s, experiments=tuple(_with_rigid(e, m) for e, m in pairs))
+        return replace(s, experiments=tuple(_with_column(e, "rigid_body_torque_nm", m) for e, m in pairs))
 
     return change
 
 
-def _with_rigid(e: Experiment, more_nm: Array) -> Experiment:
-    return columns(e, lambda name, column: column + more_nm if name == "rigid_body_torque_nm" else column)
+def _with_column(e: Experiment, changed: str, more_nm: Array) -> Experiment:
+    return columns(e, lambda name, column: column + more_nm if name == changed else column)
 
 
 def _load(mass_share: float) -> Added:
@@ -197,6 +198,24 @@ def _load(mass_share: float) -> Added:
         return torque
 
     return added
+
+
+def _at_the_tip(kilograms: float) -> Change:
+    """A point mass at the end of the double pendulum's second link, which moves as both joints do."""
+
+    def change(s: ExperimentSet) -> ExperimentSet | None:
+        folder = real_data()
+        if folder is None or not s.name.startswith("double_pendulum"):
+            return None
+        _, prefix, _, joint = s.name.split()
+        number, g, (first, second) = int(joint), 9.81, LINKS_M
+        mass = kilograms * np.array([first**2 + second**2, second**2, first * second, g * first, g * second])
+        logs = {log.name: log for log in swings(folder, prefix)}
+        more = [two_link(logs[e.name], number) @ mass for e in s.experiments]
+        pairs = zip(s.experiments, more, strict=True)
+        return replace(s, experiments=tuple(_with_column(e, "torque_nm", m) for e, m in pairs))
+
+    return change
 
 
 def _cogging(cycles: float, share: float) -> Added:
@@ -267,6 +286,7 @@ VARIANTS: dict[str, Variant] = {
     **{f"rigid body x {f:g}": Variant(_rigid(f), LOADS) for f in (0.9, 1.1, 1.2)},
     **{f"inertia believed x {f:g}": Variant(_inertia(f), ("inertia_error",)) for f in (0.5, 2.0)},
     "a payload": Variant(_torque(_load(0.5)), LOADS),
+    "a payload at the tip": Variant(_at_the_tip(0.5), LOADS),
     "a payload in judged logs": Variant(_torque(_load(0.5), lambda e: e.validation), None),
     "pushes": Variant(_torque(_pushed), None),
     "pushes in judged logs": Variant(_torque(_pushed, lambda e: e.validation), None),
