@@ -25,9 +25,10 @@ from frictid_hil.gap.channel import (
 from frictid_hil.gap.experiment_set import Nominal
 from frictid_hil.gap.generic import WHOLE, families
 from frictid_hil.gap.noise import LOCAL_S
-from frictid_hil.gap.nuisances import about_its_level, bent_rate_nm, nuisances
+from frictid_hil.gap.nuisances import bent_rate_nm, nuisances
 from frictid_hil.gap.position_noise import differenced_rms, quiet_views, white_rms
 from frictid_hil.gap.residuals import LowPass, Recording, first_slide, reported, rms
+from frictid_hil.gap.rigid_column import about_its_level
 from frictid_hil.simulation.effect import Region
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import View

@@ -9,8 +9,8 @@ import pytest
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
-from frictid_hil.gap.nuisances import held_by_column
 from frictid_hil.gap.residuals import recordings
+from frictid_hil.gap.rigid_column import held_by_column
 from frictid_hil.simulation.inverse import View
 
 INERTIA, GRAVITY = 0.4, 4.0
