@@ -69,7 +69,7 @@ def _check(e: Experiment, nominal: Nominal) -> None:
     if e.velocity_rad_s is not None:
         _check_velocity(e, e.velocity_rad_s)
     if e.position_command_rad is not None:
-        _check_command(e, e.position_command_rad)
+        _check_halt(e, e.position_command_rad)
 
 
 def _check_time(e: Experiment) -> None:
@@ -117,7 +117,8 @@ def _check_velocity(e: Experiment, velocity_rad_s: Array) -> None:
     )
 
 
-def _check_command(e: Experiment, command: Array) -> None:
+def _check_halt(e: Experiment, command: Array) -> None:
+    """A position does not stand still, far from its command, as a sensor does that has stopped."""
     start, rows = _longest_halt(e.position_rad)
     inside = slice(start, start + rows)
     error = np.abs(command - e.position_rad)
