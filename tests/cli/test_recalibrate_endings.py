@@ -219,6 +219,7 @@ def test_a_night_that_could_not_begin_is_notified_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.wall_clock
 def test_a_signal_during_motion_is_told_like_every_other_ending(first_night: Path, tmp_path: Path) -> None:
     shutil.copytree(first_night, tmp_path / "store")
     command = [sys.executable, "-m", "frictid_hil.cli.app", *arguments(tmp_path, robot_file(tmp_path)), "--realtime"]
@@ -226,10 +227,11 @@ def test_a_signal_during_motion_is_told_like_every_other_ending(first_night: Pat
     samples = tmp_path / "run" / "samples.mcap"
     until = time.monotonic() + 60.0
     while not (samples.exists() and samples.stat().st_size > 100_000) and time.monotonic() < until:
+        assert night.poll() is None, night.communicate()[0]
         time.sleep(0.05)
     night.send_signal(signal.SIGTERM)
     said, complained = night.communicate(timeout=60)
-    assert night.returncode == 130, complained
+    assert night.returncode == 130, said + complained
     (line,) = said.splitlines()
     result = json.loads(line)
     assert (result["outcome"], result["promoted"]) == ("interrupted", False) and result["next_step"]

@@ -16,7 +16,7 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -28,13 +28,14 @@ from frictid_hil.errors import InputFileError
 from frictid_hil.recording.bus_log import read_frames
 from frictid_hil.recording.mcap_reader import read_mcap
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.wall_clock]
 
 JOINT = "5"
 NODE = 6
 COUNTS_PER_RAD = 131072 * 81.5 / (2 * math.pi)
-TRIES = 4
-STALLED = ("the computer was late", "no heartbeat for")  # what a run says that a stall of 0.1 s or more has ended
+# What is killed here is late by a tenth of a second at least; what a busy computer is late by need not end the run.
+CARE = {"silence_s": 0.2, "following_error_rad": 0.4}
+ROBOT = {"schema": "frictid.robot/1", "extends": "hp3j", "name": "patient", "cycle_hz": 250, "care": CARE}
 
 
 class Terminal:
@@ -72,13 +73,16 @@ class Running:
 
     def __init__(self, out: Path, channel: str, terminal: Terminal | None = None) -> None:
         self.out = out
+        out.mkdir(parents=True)
+        robot = out.with_suffix(".yaml")
+        robot.write_text(json.dumps(ROBOT))
         self.terminal = terminal
         shown_on = None if terminal is None else terminal.program_side
         program = Path(sys.executable).parent / "frictid-hil"
         self.parent = subprocess.Popen(
             [
                 str(program),
-                *("calibrate", "--robot", "hp3j", "--joint", JOINT, "--cycles", "3", "--realtime", "--yes"),
+                *("calibrate", "--robot", str(robot), "--joint", JOINT, "--cycles", "3", "--realtime", "--yes"),
                 *("--bus", f"virtual:{channel}", "--out", str(out)),
             ],
             stdin=shown_on,
@@ -92,27 +96,26 @@ class Running:
             os.close(shown_on)
         self.bus = self._listen(channel)
 
-    def reaches_its_cycles(self) -> bool:
-        """Wait until it moves faster than the slow moves around the cycles do; False where it ends first."""
+    def reaches_its_cycles(self) -> None:
+        """Wait until it moves faster than the slow moves around the cycles do."""
         until = time.monotonic() + 60
         before: tuple[float, float] | None = None
         with contextlib.suppress(can.CanError):  # the simulated bus ends with its owner
             while time.monotonic() < until:
                 at = self.position_rad()
-                if before is not None and at is not None and at[0] - before[0] > 0.02:
-                    if abs(at[1] - before[1]) / (at[0] - before[0]) > math.radians(40):
-                        return True
+                if before is not None and at is not None and at[0] - before[0] > 0.1:
+                    if abs(at[1] - before[1]) / (at[0] - before[0]) > math.radians(60):
+                        return
                     before = at
                 before = before or at
-            raise AssertionError("the cycles never began")
-        return False
+        raise AssertionError(f"the cycles never began: {self.last_words()}")
 
     def position_rad(self) -> tuple[float, float] | None:
-        """(time, position) of the next report of the joint."""
+        """(time it was sent, position) of the next report of the joint."""
         message = self.bus.recv(0.5)
         if message is None or message.arbitration_id != 0x180 + NODE or len(message.data) < 6:
             return None
-        return time.monotonic(), struct.unpack_from("<i", message.data, 2)[0] / COUNTS_PER_RAD
+        return message.timestamp, struct.unpack_from("<i", message.data, 2)[0] / COUNTS_PER_RAD
 
     def child(self) -> psutil.Process:
         """The process of the cyclic loop."""
@@ -150,19 +153,13 @@ class Running:
 
 
 @contextlib.contextmanager
-def in_its_cycles(folder: Path, terminal: Callable[[], Terminal | None] = lambda: None) -> Iterator[Running]:
-    """A run in its cycles; a new one where this computer stalled before they began, and the drives rightly ended it."""
-    for number in range(TRIES):
-        run = Running(folder / f"run-{number}", f"kill-{os.getpid()}-{folder.name}-{number}", terminal())
-        try:
-            if run.reaches_its_cycles():
-                yield run
-                return
-            said = run.last_words()
-            assert run.parent.returncode == 4 and any(words in said for words in STALLED), f"ended early: {said}"
-        finally:
-            run.end()
-    raise AssertionError(f"stalled {TRIES} times: {said}")
+def in_its_cycles(folder: Path, terminal: Terminal | None = None) -> Iterator[Running]:
+    run = Running(folder / "run", f"kill-{os.getpid()}-{folder.name}", terminal)
+    try:
+        run.reaches_its_cycles()
+        yield run
+    finally:
+        run.end()
 
 
 @pytest.fixture
@@ -223,7 +220,7 @@ def test_a_killed_loop_leaves_the_joint_to_the_drives_watchdog(running: Running)
     assert status & 0x6F != 0x27, "no longer in operation enabled"
     said = running.last_words()
     assert running.parent.returncode == 4, said
-    assert "ended without a word" in said
+    assert "ended without a word" in said, said
     assert "Traceback" not in said
     assert running.last_run_time_s() > 3.0
 
@@ -240,7 +237,7 @@ def test_a_suspended_loop_does_not_hang_its_parent(running: Running) -> None:
     running.parent.send_signal(signal.SIGINT)
     said = running.last_words()
     assert running.parent.returncode == 4, said
-    assert "hung" in said and "may still have power" in said
+    assert "hung" in said and "may still have power" in said, said
     assert "Traceback" not in said
     assert not loop.is_running() or loop.status() == psutil.STATUS_ZOMBIE
     assert not mine & shared_memory()
@@ -251,18 +248,20 @@ def test_a_hang_up_stops_the_run_like_ctrl_c_and_leaves_no_shared_memory(running
     running.parent.send_signal(signal.SIGHUP)
     said = running.last_words()
     assert running.parent.returncode == 130, said
-    assert "brought to rest" in said
+    assert "brought to rest" in said, said
     assert mine and not mine & shared_memory()
 
 
 def test_a_closed_terminal_stops_the_run_like_ctrl_c(tmp_path: Path) -> None:
-    with in_its_cycles(tmp_path, Terminal) as run:
+    with in_its_cycles(tmp_path, Terminal()) as run:
         assert run.terminal is not None
         run.terminal.close()
         positions_until_quiet(run, 0.5)
         run.bus.shutdown()
-        assert run.parent.wait(60) == 130
-        assert json.loads((run.out / "manifest.json").read_text())["outcome"] == "interrupted"
+        run.parent.wait(60)
+        manifest = (run.out / "manifest.json").read_text()
+        assert run.parent.returncode == 130, manifest
+        assert json.loads(manifest)["outcome"] == "interrupted"
         assert run.last_run_time_s() > 3.0
 
 
@@ -272,7 +271,7 @@ def speed_at_the_quick_stop_rad_s(run: Running) -> float:
     reports = np.flatnonzero((frames.can_id == 0x180 + NODE) & (frames.length >= 6))
     position = frames.data[reports, 2:6].copy().view("<i4")[:, 0] / COUNTS_PER_RAD
     began = int(np.flatnonzero(frames.data[reports, 0] & 0x6F == 0x07)[0])
-    before = slice(began - 10, began)
+    before = slice(began - 3, began)
     return float(np.ptp(position[before]) / np.ptp(frames.t_ns[reports][before]) * 1e9)
 
 
@@ -283,14 +282,14 @@ def test_twice_stops_quickly(running: Running, first: int, second: int) -> None:
     said = running.last_words()
     assert running.parent.returncode == 130, said
     assert "Traceback" not in said
-    assert speed_at_the_quick_stop_rad_s(running) > math.radians(10)
+    assert speed_at_the_quick_stop_rad_s(running) > math.radians(10), "no quick stop, or the second signal was late"
 
 
 def test_ctrl_c_decelerates_keeps_the_log_and_exits_130(running: Running) -> None:
     running.parent.send_signal(signal.SIGINT)
     said = running.last_words()
     assert running.parent.returncode == 130, said
-    assert "brought to rest" in said
+    assert "brought to rest" in said, said
     assert "Traceback" not in said
     assert running.last_run_time_s() > 3.0
     assert speed_at_the_quick_stop_rad_s(running) < math.radians(2)
