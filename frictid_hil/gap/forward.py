@@ -23,9 +23,9 @@ from frictid_hil.simulation.replay import SUBSTEP_S, CarryOver, Controller, Simu
 Effects = Mapping[str, Mapping[str, float]]
 
 SAME_RATE = 0.05  # a row holds a whole number of control ticks where the two clocks differ by no more than this share
-RIGID_SUBSTEP_S = 2e-4
-"""Sub-step of a joint whose link does not swing. Half of it changes the torque of drawn joints by a few hundredths of
-the noise, with a directional efficiency by a quarter; a joint that hunts about a step is another draw."""
+RIGID_SUBSTEP_S = 5e-4
+"""Sub-step of a joint whose link does not swing. A fifth of it changes the torque of drawn joints by a few hundredths of
+the noise, where an encoder's steps decide when a joint lets go or its gear loses much of the torque by a quarter."""
 SETTLING_S = 0.3  # time the controller takes after the first slide to forget the start
 
 
