@@ -24,8 +24,8 @@ Effects = Mapping[str, Mapping[str, float]]
 
 SAME_RATE = 0.05  # a row holds a whole number of control ticks where the two clocks differ by no more than this share
 RIGID_SUBSTEP_S = 5e-4
-"""Sub-step of a joint whose link does not swing. A fifth of it changes the torque of drawn joints by a few hundredths of
-the noise, where an encoder's steps decide when a joint lets go or its gear loses much of the torque by a quarter."""
+"""Sub-step of a joint whose link does not swing. A fifth of it changes the torque of drawn joints by a few hundredths
+of the noise, where an encoder's steps decide when a joint lets go or its gear loses much of the torque by a quarter."""
 SETTLING_S = 0.3  # time the controller takes after the first slide to forget the start
 
 
