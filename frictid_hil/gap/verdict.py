@@ -16,7 +16,7 @@ from frictid_hil.gap.posterior import VISIBLE, Draw, form_of
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
-FLOORS = 2.0  # a gap below so many noise floors is none, by promise
+FLOORS = 2.0  # a gap above so many noise floors is never none, unless it means nothing in practice, by promise
 AS_STATED = 0.5  # error of a belief over its one-sigma, below which it is as right as it says
 MOST_EXPECTED = 2.0  # the same, above which an error is not to be expected: 95 of 100 beliefs are nearer
 FLOORS_AS_STATED = 3.0
@@ -81,15 +81,14 @@ def verdict(
     nothing = not named or (float(np.median(explained)) < STANDS_OUT and not sure)
     generic_wins = float(np.mean(generic > explained)) > 0.5 and float(np.median(generic)) > STANDS_OUT
     loud = [c for c, gap in zip(channels, gaps, strict=True) if gap.before > FLOORS * gap.floor]
-    # A gap that is small beside the noise and small in practice is none, whatever tolerance explains it.
-    floors = FLOORS_AS_STATED if as_stated(named, channels) else FLOORS
-    tiny = quiet and all(gap.before <= min(floors * gap.floor, negligible) for gap in gaps)
-    shows = any(gap.before > SHOWS * gap.floor for gap in gaps)
+    # A gap that hardly shows beside the noise is none, and a larger one if every likely cause is within what is stated.
+    floors = FLOORS_AS_STATED if as_stated(named, channels) else SHOWS
+    tiny = not told and not sure and all(gap.before <= min(floors * gap.floor, negligible) for gap in gaps)
     # What identification logs plainly hold is no "none" because the validation logs never came to it.
     known = sure or any(needed(f, channels) for f in named)
-    tiny = tiny and not told and not sure and not (shows and known)
+    shows = any(gap.before > SHOWS * gap.floor for gap in gaps)
     doubtful = all(f.chance < EVEN for f in named) or not (shows or known)  # within noise, so as well none
-    if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):
+    if quiet and (tiny or (not told and (nothing or generic_wins or doubtful))):
         return Verdict("none", ())
     # Where functions without a name describe it as well, the names tell the gap only if they close it, and not at all
     # where those functions make more of it.

@@ -52,6 +52,7 @@ def test_a_drive_that_falls_silent_while_moving_ends_in_a_safety_stop_and_keeps_
 
 
 @pytest.mark.slow
+@pytest.mark.wall_clock
 def test_two_processes_on_one_bus(tmp_path: Path) -> None:
     first = subprocess.Popen(
         [PROGRAM, "calibrate", "--robot", "hp3j", *SHORT, "--realtime", "--out", str(tmp_path / "first")],
@@ -64,6 +65,7 @@ def test_two_processes_on_one_bus(tmp_path: Path) -> None:
         while not (frames.exists() and frames.stat().st_size > 1000) and time.monotonic() < until:
             time.sleep(0.1)
         second = run("calibrate", "--robot", "hp3j", *SHORT, "--realtime", cwd=tmp_path)
+        assert first.poll() is None, "the first one was late, and ended"
         assert second.returncode == 3, second.stderr
         assert "in use" in second.stderr
     finally:
