@@ -170,7 +170,7 @@ def _inertia(factor: float) -> Change:
             assert e.rigid_body_torque_nm is not None
             step, q = float(np.median(np.diff(e.time_s))), e.position_rad
             low_pass = LowPass.at(1.0 / step)
-            accelerations.append(np.gradient(np.gradient(low_pass(q), step), step))
+            accelerations.append(np.gradient(np.gradient(q, step), step))
             own = [accelerations[-1], np.cos(q), np.sin(q), np.ones_like(q), e.rigid_body_torque_nm]
             tables.append(low_pass(np.stack(own, axis=1))[10:-10])
         table = np.concatenate(tables)

@@ -16,15 +16,19 @@ from frictid_hil.simulation.inverse import View
 IN_COLUMN = ("inertia_error", "gravity_error")  # what a rigid-body column may be wrong by
 APART = 0.2  # part of the acceleration that the angle must leave untold: 4 % of its power
 ON_AND_ON_RAD = 4.0 * np.pi  # travel of a joint that turns on and on, as no arm does
+FILTERS_HZ = (4.0, 7.0, 13.0)  # low-passes that an acceleration may have passed; sums of them make others
+OWN = slice(0, 1 + len(FILTERS_HZ))  # columns of a table that are made of the acceleration
+ANGLE = slice(OWN.stop, OWN.stop + 3)  # columns of it that are made of the angle
+ALIKE = 1e-4  # part of the largest singular value below which filters are taken for alike
 LEVEL = "about its level"  # shape of an error of gravity whose level is an offset
 
 
 def held_by_column(nominal: Nominal, views: Sequence[View], logs: Sequence[Recording]) -> list[View] | None:
     """The views with the inertia and the gravity that a rigid-body column holds.
 
-    The part of the column that goes with the joint's own acceleration is its inertia. The rest is its gravity; where a
-    joint turns on and on, only what depends on its own angle. A part that varies by less than the column's tolerance
-    counts as an error of its making, and is left out.
+    The part of the column that goes with the joint's own acceleration, filtered as its maker has filtered it, is its
+    inertia. The rest is its gravity; where a joint turns on and on, only what depends on its own angle. A part that
+    varies by less than the column's tolerance counts as an error of its making, and is left out.
 
     None where it holds neither, where the file states an inertia, where a log lacks the column or carries another load
     than the others, and where the motion hardly tells acceleration from gravity, as one slow sine does.
@@ -32,22 +36,26 @@ def held_by_column(nominal: Nominal, views: Sequence[View], logs: Sequence[Recor
     loads = {r.experiment.payload for r in logs}
     if nominal.inertia_kg_m2 or len(loads) > 1 or any(r.experiment.rigid_body_torque_nm is None for r in logs):
         return None
-    own = [np.stack([v.acceleration_rad_s2, *_over_angle(v), v.load_nm], axis=1) for v in views]
+    own = [np.stack([*_filtered(v), *_over_angle(v), v.load_nm], axis=1) for v in views]
     table = np.concatenate([_slow(part, v)[5:-5] for part, v in zip(own, views, strict=True)])
-    acceleration, angle, column = table[:, 0], table[:, 1:-1], table[:, -1]
+    acceleration, angle, column = table[:, 0], table[:, ANGLE], table[:, -1]
     apart = acceleration - angle @ np.linalg.lstsq(angle, acceleration, rcond=None)[0]
     if float(np.std(apart)) < APART * float(np.std(acceleration)):
         return None
-    inertia, *gravity = np.linalg.lstsq(table[:, :-1], column, rcond=None)[0]
+    sizes = np.maximum(np.std(table[:, :-1], axis=0), np.abs(np.mean(table[:, :-1], axis=0)))
+    shares = np.linalg.lstsq(table[:, :-1] / sizes, column, rcond=ALIKE)[0] / sizes
+    inertial = table[:, OWN] @ shares[OWN]  # what the column has of the joint's own acceleration
+    inertia = float(acceleration @ inertial / (acceleration @ acceleration))
     least_nm = nominal.tolerances.rigid_body_torque.relative * float(np.std(column))
-    inertia = float(inertia) if inertia > 0.0 and float(np.std(inertia * acceleration)) > least_nm else 0.0
-    accelerations = [v.acceleration_rad_s2 for v in views]
+    inertia = inertia if inertia > 0.0 and float(np.std(inertial)) > least_nm else 0.0
+    parts = [part[:, OWN] @ shares[OWN] for part in own]
+    accelerations = [part / inertia if inertia else v.acceleration_rad_s2 for part, v in zip(parts, views, strict=True)]
     if max(float(np.ptp(v.position_rad)) for v in views) > ON_AND_ON_RAD:
-        rests = [part[:, 1:-1] @ np.array(gravity) for part in own]
+        rests = [part[:, ANGLE] @ shares[ANGLE] for part in own]
         # Lines over position shake the speed; their fast acceleration tells no inertia.
         accelerations = [_slow(a, v) for a, v in zip(accelerations, views, strict=True)]
     else:  # Gravity changes with the posture; what is faster comes from how the column was differentiated.
-        rests = [_slow(v.load_nm - inertia * v.acceleration_rad_s2, v) for v in views]
+        rests = [_slow(v.load_nm - inertia * a, v) for a, v in zip(accelerations, views, strict=True)]
     share = 1.0 if float(np.std(np.concatenate(rests))) > least_nm else 0.0
     if not inertia and not share:
         return None
@@ -65,6 +73,12 @@ def about_its_level(candidates: Sequence[Term], builder: Builder) -> list[Term]:
         level = np.mean(np.concatenate(parts))
         terms.append(replace(gravity, shape={LEVEL: 1.0}, columns=builder.add([part - level for part in parts])))
     return terms
+
+
+def _filtered(view: View) -> list[Array]:
+    """The acceleration, as it is and behind low-passes: its maker may have used one, or a slope over several rows."""
+    a = view.acceleration_rad_s2
+    return [a, *(LowPass(1.0 / view.step_s, hertz)(a) for hertz in FILTERS_HZ)]
 
 
 def _over_angle(view: View) -> tuple[Array, Array, Array]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
@@ -53,6 +54,20 @@ def test_a_column_is_an_inertia_and_a_gravity(inertia: float, gravity: float) ->
     assert view.link_inertia_kg_m2 == pytest.approx(inertia, rel=0.01)
     inner = slice(50, -50)
     assert view.gravity_nm[inner] == pytest.approx(gravity * np.cos(view.position_rad[inner]), abs=0.01 * GRAVITY)
+
+
+@pytest.mark.parametrize("hertz", [6.0, 10.0, 18.0])
+def test_its_maker_may_have_filtered_the_acceleration(hertz: float) -> None:
+    plain = log(motion(0.3, 1.1, 5.0, 11.0, radians=0.1), gravity=0.0)
+    assert plain.rigid_body_torque_nm is not None
+    filtered = signal.sosfiltfilt(signal.butter(2, hertz, fs=1.0 / STEP_S, output="sos"), plain.rigid_body_torque_nm)
+    views = held(replace(plain, rigid_body_torque_nm=filtered + GRAVITY * np.cos(plain.position_rad)))
+    assert views is not None
+    (view,) = views
+    inner = slice(300, -300)
+    inertial, swing = view.link_inertia_kg_m2 * view.acceleration_rad_s2, float(np.std(filtered))
+    assert np.std((inertial - filtered)[inner]) < 0.03 * swing
+    assert view.gravity_nm[inner] == pytest.approx(GRAVITY * np.cos(view.position_rad[inner]), abs=0.1 * swing)
 
 
 def test_one_slow_sine_tells_neither() -> None:
