@@ -93,7 +93,7 @@ def sampled(posterior: Posterior) -> Sampled:
         # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
         named = {**causes, **({"": parts[""]} if "" in parts else {})}
         inner = _products(list(named.values()), gram)
-        told = _net(inner, np.array([form_of(name) for name in named]))
+        told = _net(inner, np.array([form_of(name) for name in named]), np.array([name in sided for name in named]))
         for effect, net, blur in zip(causes, *told, strict=False):
             sizes[effect][k] = net / posterior.floor
             signs[effect][k] = np.sign(np.sum(causes[effect][1])) if effect in sided else 1.0
@@ -147,14 +147,15 @@ def _size(inner: Array) -> float:
     return math.sqrt(max(0.0, float(np.sum(inner))))
 
 
-def _net(inner: Array, forms: Array) -> tuple[Array, Array]:
+def _net(inner: Array, forms: Array, beliefs: np.ndarray) -> tuple[Array, Array]:
     """(RMS of what each cause makes less what others take back, one-sigma of what their forms may have put on it).
 
     ``inner`` holds the mean products of what the causes make; ``forms`` is how far each may be off its form, over its
-    size.
+    size; ``beliefs`` are errors of one believed number each.
 
-    A pair that more than half cancels explains nothing. A cause that moves as a larger one does is told from it by
-    their forms alone, and no joint is quite as its formula.
+    A pair that more than half cancels explains nothing, and of errors of the belief only what all of them leave: a
+    torque constant takes back what inertia, gravity and friction make that are off alike. A cause that moves as a
+    larger one does is told from it by their forms alone, and no joint is quite as its formula.
     """
     if not inner.size:
         return np.zeros(0), np.zeros(0)
@@ -163,6 +164,8 @@ def _net(inner: Array, forms: Array) -> tuple[Array, Array]:
     pair = squares[:, None] + squares + 2.0 * inner
     cancels = pair < CANCELS * np.maximum(squares[:, None], squares)
     taken_back = np.where(cancels, inner, 0.0).sum(axis=1) / own
+    among = np.where(beliefs, (inner * beliefs).sum(axis=1) / own - own, 0.0)
+    taken_back = np.minimum(taken_back, among)
     net: Array = np.maximum(0.0, own + taken_back)
     alike = inner / (own[:, None] * own)
     lent = forms * own / np.sqrt(np.maximum(1.0 - alike**2, FORM**2))
