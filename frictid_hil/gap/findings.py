@@ -23,6 +23,7 @@ ABSENT = 0.2
 """Size, over the floor, below which a cause is absent: it adds a fiftieth. Between the two it is neither."""
 ALIKE = 0.05  # chance of another cause in the place of one from which the two are called confusable
 EVEN = 0.5  # chance below which a cause is likelier not there
+EITHER = 0.25  # chance that an error shows one way or the other from which it is a rival of what is told
 SIDED = 0.75
 """Share of the chance on the side that is told, below which an error of the belief may as well be the other way round:
 it is no cause that could be told."""
@@ -211,11 +212,11 @@ def told_numbers(found: Iterable[Finding]) -> dict[str, dict[str, float]]:
 
 
 def either_way(channels: Sequence[Sampled]) -> list[str]:
-    """Errors of the belief that are likely to show, as well one way as the other; first what others pass for most."""
+    """Errors of the belief that may show, as well one way as the other; first what others pass for most."""
     blurs = {}
     for name in sorted({name for channel in channels for name in channel.sizes}):
         told, other = _sides(name, channels)
-        if told < SIDED * (told + other) and told + other >= EVEN:
+        if told < SIDED * (told + other) and told + other >= EITHER:
             blurs[name] = rms(_over_channels("blurs", name, channels))
     return sorted(blurs, key=lambda name: -blurs[name])
 
