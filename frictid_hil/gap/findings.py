@@ -154,9 +154,9 @@ def _net(inner: Array, forms: Array, beliefs: np.ndarray) -> tuple[Array, Array]
     ``inner`` holds the mean products of what the causes make; ``forms`` is how far each may be off its form, over its
     size; ``beliefs`` are errors of one believed number each.
 
-    A pair that more than half cancels explains nothing, and of errors of the belief only what all of them leave: a
-    torque constant takes back what inertia, gravity and friction make that are off alike. A cause that moves as a
-    larger one does is told from it by their forms alone, and no joint is quite as its formula.
+    A pair that more than half cancels explains nothing. Of an error of the belief only that counts which the sum of
+    all of them has along it: a torque constant takes back what inertia, gravity and friction make that are off alike.
+    A cause that moves as a larger one does is told from it by their forms alone, and no joint is quite as its formula.
     """
     if not inner.size:
         return np.zeros(0), np.zeros(0)

@@ -24,8 +24,10 @@ Effects = Mapping[str, Mapping[str, float]]
 
 SAME_RATE = 0.05  # a row holds a whole number of control ticks where the two clocks differ by no more than this share
 RIGID_SUBSTEP_S = 5e-4
-"""Sub-step of a joint whose link does not swing. A fifth of it changes the torque of drawn joints by a few hundredths
-of the noise, where an encoder's steps decide when a joint lets go or its gear loses much of the torque by a quarter."""
+"""Sub-step of a joint whose link does not swing and whose friction is no bristle. A fifth of it changes the torque of
+drawn joints by a few hundredths of the noise; by a quarter of it where an encoder's steps decide when a joint lets go,
+or where a gear loses much of the torque."""
+BRISTLE = "presliding_hysteresis"  # is integrated step by step: a light joint on a stiff one needs the short sub-step
 SETTLING_S = 0.3  # time the controller takes after the first slide to forget the start
 
 
@@ -204,7 +206,8 @@ class Replay:
         # A log's clock and its controller's differ a little; a row is a whole number of ticks all the same.
         exact = abs(self._controller.rate_hz * step_s / ticks - 1.0) < SAME_RATE
         controller = replace(self._controller, rate_hz=ticks / step_s) if exact else self._controller
-        substep_s = SUBSTEP_S if any(all_effects()[name].swings for name in model.effects) else RIGID_SUBSTEP_S
+        stiff = BRISTLE in model.effects or any(all_effects()[name].swings for name in model.effects)
+        substep_s = SUBSTEP_S if stiff else RIGID_SUBSTEP_S
         rows = closed_loop(model, controller, time, command, payload=e.payload, state=state, substep_s=substep_s)
         torque = reported(rows.torque_nm, self._report, float(np.median(np.diff(time))))
         return replace(

@@ -28,7 +28,8 @@ def held_by_column(nominal: Nominal, views: Sequence[View], logs: Sequence[Recor
 
     The part of the column that goes with the joint's own acceleration, filtered as its maker has filtered it, is its
     inertia. The rest is its gravity; where a joint turns on and on, only what depends on its own angle. A part that
-    varies by less than the column's tolerance counts as an error of its making, and is left out.
+    varies by less than the column's tolerance counts as an error of its making, and is left out. Behind a filter only
+    the product of the views' inertia and acceleration means anything: it is what the column holds.
 
     None where it holds neither, where the file states an inertia, where a log lacks the column or carries another load
     than the others, and where the motion hardly tells acceleration from gravity, as one slow sine does.
@@ -42,7 +43,7 @@ def held_by_column(nominal: Nominal, views: Sequence[View], logs: Sequence[Recor
     apart = acceleration - angle @ np.linalg.lstsq(angle, acceleration, rcond=None)[0]
     if float(np.std(apart)) < APART * float(np.std(acceleration)):
         return None
-    sizes = np.maximum(np.std(table[:, :-1], axis=0), np.abs(np.mean(table[:, :-1], axis=0)))
+    sizes = np.sqrt(np.mean(table[:, :-1] ** 2, axis=0)) + 1e-300
     shares = np.linalg.lstsq(table[:, :-1] / sizes, column, rcond=ALIKE)[0] / sizes
     inertial = table[:, OWN] @ shares[OWN]  # what the column has of the joint's own acceleration
     inertia = float(acceleration @ inertial / (acceleration @ acceleration))
@@ -77,8 +78,8 @@ def about_its_level(candidates: Sequence[Term], builder: Builder) -> list[Term]:
 
 def _filtered(view: View) -> list[Array]:
     """The acceleration, as it is and behind low-passes: its maker may have used one, or a slope over several rows."""
-    a = view.acceleration_rad_s2
-    return [a, *(LowPass(1.0 / view.step_s, hertz)(a) for hertz in FILTERS_HZ)]
+    a, rate_hz = view.acceleration_rad_s2, 1.0 / view.step_s
+    return [a, *(LowPass(rate_hz, min(hertz, 0.2 * rate_hz))(a) for hertz in FILTERS_HZ)]
 
 
 def _over_angle(view: View) -> tuple[Array, Array, Array]:

@@ -81,12 +81,14 @@ def verdict(
     nothing = not named or (float(np.median(explained)) < STANDS_OUT and not sure)
     generic_wins = float(np.mean(generic > explained)) > 0.5 and float(np.median(generic)) > STANDS_OUT
     loud = [c for c, gap in zip(channels, gaps, strict=True) if gap.before > FLOORS * gap.floor]
-    # A gap that hardly shows beside the noise is none, and a larger one if every likely cause is within what is stated.
-    floors = FLOORS_AS_STATED if as_stated(named, channels) else SHOWS
-    tiny = not told and not sure and all(gap.before <= min(floors * gap.floor, negligible) for gap in gaps)
     # What identification logs plainly hold is no "none" because the validation logs never came to it.
     known = sure or any(needed(f, channels) for f in named)
     shows = any(gap.before > SHOWS * gap.floor for gap in gaps)
+    # A gap that means nothing in practice is none where it hardly shows beside the noise, and up to three floors where
+    # every likely cause is as right as is stated.
+    floors = FLOORS_AS_STATED if as_stated(named, channels) else SHOWS
+    tiny = not told and not sure and not (shows and known)
+    tiny = tiny and all(gap.before <= min(floors * gap.floor, negligible) for gap in gaps)
     doubtful = all(f.chance < EVEN for f in named) or not (shows or known)  # within noise, so as well none
     if quiet and (tiny or (not told and (nothing or generic_wins or doubtful))):
         return Verdict("none", ())

@@ -57,7 +57,8 @@ def test_two_processes_on_one_bus(tmp_path: Path) -> None:
     first = subprocess.Popen(
         [PROGRAM, "calibrate", "--robot", "hp3j", *SHORT, "--realtime", "--out", str(tmp_path / "first")],
         stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     try:
         frames = tmp_path / "first" / "bus.blf"
@@ -65,7 +66,7 @@ def test_two_processes_on_one_bus(tmp_path: Path) -> None:
         while not (frames.exists() and frames.stat().st_size > 1000) and time.monotonic() < until:
             time.sleep(0.1)
         second = run("calibrate", "--robot", "hp3j", *SHORT, "--realtime", cwd=tmp_path)
-        assert first.poll() is None, "the first one was late, and ended"
+        assert first.poll() is None, first.communicate()[1]
         assert second.returncode == 3, second.stderr
         assert "in use" in second.stderr
     finally:

@@ -227,7 +227,7 @@ def test_a_signal_during_motion_is_told_like_every_other_ending(first_night: Pat
     samples = tmp_path / "run" / "samples.mcap"
     until = time.monotonic() + 60.0
     while not (samples.exists() and samples.stat().st_size > 100_000) and time.monotonic() < until:
-        assert night.poll() is None, night.communicate()[0]
+        assert night.poll() is None, "".join(night.communicate())
         time.sleep(0.05)
     night.send_signal(signal.SIGTERM)
     said, complained = night.communicate(timeout=60)

@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.wall_clock]
 JOINT = "5"
 NODE = 6
 COUNTS_PER_RAD = 131072 * 81.5 / (2 * math.pi)
-# What is killed here is late by a tenth of a second at least; what a busy computer is late by need not end the run.
+# A busy computer pauses a loop for less than these bounds, and that must not end a run.
 CARE = {"silence_s": 0.2, "following_error_rad": 0.4}
 ROBOT = {"schema": "frictid.robot/1", "extends": "hp3j", "name": "patient", "cycle_hz": 250, "care": CARE}
 
@@ -108,6 +108,7 @@ class Running:
                         return
                     before = at
                 before = before or at
+        self.parent.terminate()
         raise AssertionError(f"the cycles never began: {self.last_words()}")
 
     def position_rad(self) -> tuple[float, float] | None:
@@ -282,7 +283,7 @@ def test_twice_stops_quickly(running: Running, first: int, second: int) -> None:
     said = running.last_words()
     assert running.parent.returncode == 130, said
     assert "Traceback" not in said
-    assert speed_at_the_quick_stop_rad_s(running) > math.radians(10), "no quick stop, or the second signal was late"
+    assert speed_at_the_quick_stop_rad_s(running) > math.radians(4), said
 
 
 def test_ctrl_c_decelerates_keeps_the_log_and_exits_130(running: Running) -> None:

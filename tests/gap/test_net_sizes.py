@@ -1,0 +1,31 @@
+"""What counts of causes that take one another back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from frictid_hil.gap.findings import _net
+
+
+def net(parts: list[list[float]], beliefs: list[bool]) -> np.ndarray:
+    """RMS that counts of each part, (n,), where parts are what causes make at some moments."""
+    made = np.array(parts)
+    sizes, _ = _net(made @ made.T / made.shape[1], np.full(len(parts), 0.1), np.array(beliefs))
+    return sizes
+
+
+def test_errors_that_only_all_together_cancel_count_for_what_they_leave() -> None:
+    scale, gravity, friction = [-1.0, -1.0, 0.1, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]
+    assert net([scale, gravity, friction], [True] * 3) == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
+    # No pair of them cancels by half, so that as causes of other kinds they count in full.
+    assert net([scale, gravity, friction], [False] * 3) == pytest.approx([0.71, 0.5, 0.5], abs=0.02)
+
+
+def test_an_error_of_the_belief_takes_nothing_back_from_a_cause() -> None:
+    cause, error = [1.0, 0.0, 0.0, 0.0], [-1.0, 1.0, 0.0, 0.0]
+    assert net([cause, error], [False, True]) == pytest.approx([0.5, 0.71], abs=0.01)
+
+
+def test_errors_that_add_count_for_their_own_size() -> None:
+    assert net([[1.0, 0.0], [1.0, 1.0]], [True, True]) == pytest.approx([0.71, 1.0], abs=0.01)
