@@ -23,6 +23,8 @@ alike. Other causes may leave ``REMAINS``."""
 FAR = 5.0
 """Gap that causes leave in closed loop, over its noise, from which on they are not what makes it, if it is half of what
 was there: an encoder's steps and a joint that sticks leave up to four."""
+STICKS = ("stribeck", "stiction_breakaway")
+"""Causes by which a joint sticks: when it lets go in closed loop, their last percents decide."""
 REFUTED = 0.4  # most that is claimed of a cause that the closed loop does not bear out
 LITTLE = "closed loop: most of its gap stays"
 NO_NEARER = "closed loop: what describes the torque along the motion brings the simulated joint no nearer"
@@ -73,6 +75,8 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> BorneOu
     or more to what the chosen ones leave, or ``REMAINS`` if another one explains the gap.
     """
     values = told_numbers(said.named)
+    described = said.word != "unknown" and not open_along
+    retried = frozenset(name for name in values if swings(name) or (described and name in STICKS))
     rivals = {f.effect: f.rivals for f in said.named}
     kept, gap_nm, beside = _chosen(values, rivals, loop)
     doubtful = _stays(HALF, gap_nm, loop)
@@ -84,20 +88,33 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> BorneOu
     refuted = _refuted(said, values, beside, gap_nm, loop)
     idle = frozenset(values) - set(kept) if kept else frozenset[str]()
     if refuted:
-        return BorneOut(*_without(said, refuted, kept, gap_nm, loop, open_along=open_along), idle, frozenset(refuted))
+        return BorneOut(
+            *_without(said, refuted, kept, gap_nm, loop, retried, open_along=open_along), idle, frozenset(refuted)
+        )
     if said.word == "unknown":
-        return BorneOut(*_closed(said, values, kept, gap_nm, loop), idle)
+        return BorneOut(*_closed(said, values, kept, gap_nm, loop, retried), idle)
     guesses = loop.guessed and all(f.where == "actuation" for f in said.named)
     far = gap_nm > FAR * loop.floor_nm
     open_still = (open_along or guesses or far) and _stays(HALF, gap_nm, loop)
     if open_still and _shows(kept, gap_nm, loop) and not _read(said, loop):
+        if kept and retried:
+            rescued, told = _rescued(said, values, kept, loop, retried)
+            if told is not None:
+                return BorneOut(rescued, told, idle)
         # However small the gap along the motion is in practice: these causes are not what makes it.
         return BorneOut(_none_of_these(said, kept), _told(kept, refuted, loop, gap_nm), idle)
     return BorneOut(_doubted(said) if kept and doubtful and not _read(said, loop) else said, None, idle)
 
 
 def _without(
-    said: Verdict, refuted: set[str], kept: Sequence[str], gap_nm: float, loop: Loop, *, open_along: bool
+    said: Verdict,
+    refuted: set[str],
+    kept: Sequence[str],
+    gap_nm: float,
+    loop: Loop,
+    retried: Collection[str],
+    *,
+    open_along: bool,
 ) -> tuple[Verdict, str]:
     """The verdict less the causes that the loop refutes, and what to tell of that."""
     told = _told(kept, refuted, loop, gap_nm)
@@ -105,8 +122,9 @@ def _without(
     falls = [f for f in said.named if f.effect in refuted]
     stands = [_instead_of(f, falls) for f in said.named if f.effect not in refuted]
     falls = [f.at_most(REFUTED) for f in falls]
-    if _stays(HALF, gap_nm, loop) and any(swings(f.effect) for f in stands):
-        rescued, closes = _rescued(Verdict("unknown", tuple(stands)), told_numbers(stands), kept, loop, refuted)
+    if _stays(HALF, gap_nm, loop) and any(f.effect in retried for f in stands):
+        left = Verdict("unknown", tuple(stands))
+        rescued, closes = _rescued(left, told_numbers(stands), kept, loop, retried, refuted)
         if closes is not None:
             return replace(rescued, named=(*rescued.named, *falls)), closes
     open_still = (open_along or bool(kept)) and _stays(HALF, gap_nm, loop)
@@ -118,7 +136,7 @@ def _without(
     stands.sort(key=lambda f: kept.index(f.effect) if f.effect in kept else len(kept))
     stands = [f if f.where == READ_DIRECTLY else f.at_most(DOUBTED) for f in stands]
     helping = told_numbers(f for f in stands if f.effect in kept)
-    stands, gap_nm = _refined(stands, helping, loop, gap_nm)
+    stands, gap_nm = _refined(stands, helping, loop, gap_nm, retried)
     told = _told(kept, refuted, loop, gap_nm)
     if _closes(said, kept, gap_nm, loop) or any(f.where == READ_DIRECTLY for f in stands):
         # What is read from the positions themselves is there, whatever the loop makes of the others.
@@ -127,11 +145,11 @@ def _without(
 
 
 def _closed(
-    said: Verdict, values: Effects, kept: Sequence[str], gap_nm: float, loop: Loop
+    said: Verdict, values: Effects, kept: Sequence[str], gap_nm: float, loop: Loop, retried: Collection[str]
 ) -> tuple[Verdict, str | None]:
     """What has no name along the motion is no part of the gap where the causes close the loop."""
-    if any(swings(name) for name in values) and _stays(REMAINS, gap_nm, loop):
-        rescued, told = _rescued(said, values, kept, loop)
+    if retried and _stays(REMAINS, gap_nm, loop):
+        rescued, told = _rescued(said, values, kept, loop, retried)
         if told is not None:
             return rescued, told
     shows = loop.before_nm > FLOORS * loop.floor_nm
@@ -192,12 +210,17 @@ def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm
 
 
 def _rescued(
-    said: Verdict, values: Effects, kept: Sequence[str], loop: Loop, refuted: Collection[str] = ()
+    said: Verdict,
+    values: Effects,
+    kept: Sequence[str],
+    loop: Loop,
+    retried: Collection[str],
+    refuted: Collection[str] = (),
 ) -> tuple[Verdict, str | None]:
-    """Causes that let the link swing may close the loop, although their columns lose the link's phase."""
+    """Causes may close the loop with other numbers, where a motion hardly tells them well enough for that."""
     helping = {name: values[name] for name in values if name in kept or swings(name)}
     before = [f for f in said.named if f.effect in helping]
-    stands, closer_nm = _refined(before, helping, loop, loop.gap_nm(helping))
+    stands, closer_nm = _refined(before, helping, loop, loop.gap_nm(helping), retried)
     if stands == before or _stays(BOUNCED, closer_nm, loop):
         return said, None
     rest = [f for f in said.named if f.effect not in helping]
@@ -276,14 +299,17 @@ def _taken_off(values: Effects, loop: Loop) -> tuple[list[str], float]:
     return kept, gap_nm
 
 
-def _refined(stands: Sequence[Finding], kept: Effects, loop: Loop, gap_nm: float) -> tuple[list[Finding], float]:
-    """(the causes, those that let the link swing with the numbers that bring the simulated joint nearest; its gap).
+def _refined(
+    stands: Sequence[Finding], kept: Effects, loop: Loop, gap_nm: float, retried: Collection[str]
+) -> tuple[list[Finding], float]:
+    """(the causes, those ``retried`` with the numbers that bring the simulated joint nearest; its gap).
 
-    Columns along the measured motion lose the phase of a link that swings, so that they tell too little of it.
+    Columns along the measured motion lose the phase of a link that swings, so that they tell too little of it; and a
+    joint that sticks lets go by the last percent of its friction.
     """
     helping, result = dict(kept), []
     for one in stands:
-        if one.effect in kept and swings(one.effect):
+        if one.effect in kept and one.effect in retried:
             one, gap_nm = _nearest(one, helping, loop, gap_nm)
             helping[one.effect] = {name: v.value for name, v in one.parameters.items()}
         result.append(one)

@@ -190,6 +190,24 @@ def test_elasticity_that_the_motion_tells_badly_is_rescued_by_the_loop() -> None
     assert told is not None and "would take" not in told
 
 
+@pytest.mark.parametrize(("open_along", "word"), [(False, "explained"), (True, "unknown")])
+def test_friction_that_describes_the_motion_is_tried_with_other_numbers_where_the_joint_sticks(
+    open_along: bool, word: str
+) -> None:
+    """The joint let go too early with a Stribeck velocity a third too high, and half of its gap stayed: `unknown`."""
+    falling = cause("stribeck", share=0.5, stribeck_velocity_rad_s=0.056)
+
+    def gap_nm(effects: Effects) -> float:
+        told = effects.get("stribeck")
+        return 1.0 if told is None else 0.1 + 30.0 * abs(told["stribeck_velocity_rad_s"] - 0.039)
+
+    said, told = answer(Verdict("explained", (falling,)), Loop(gap_nm, 1.0, 0.02), open_along=open_along)
+    assert said.word == word
+    velocity = said.named[0].parameters["stribeck_velocity_rad_s"].value
+    assert velocity == pytest.approx(0.056 if open_along else 0.039, rel=0.03)
+    assert (told or "").endswith("with stribeck")
+
+
 def test_play_of_a_fifth_of_its_size_is_rescued_beside_a_larger_cause() -> None:
     """Gravity took most of the gap, play as the motion tells it next to nothing, and the rest was `unknown`."""
     play = cause("backlash", gap_rad=2e-3, contact_stiffness_nm_per_rad=2e5, contact_relaxation_s=3e-3)
