@@ -159,7 +159,7 @@ def _rigid(factor: float) -> Change:
     return change
 
 
-def _inertia(factor: float) -> Change:
+def _inertia(factor: float, *, filtered: bool = False) -> Change:
     """A rigid-body column whose inertia is another than the joint's: what of it goes with the joint's acceleration."""
 
     def change(s: ExperimentSet) -> ExperimentSet | None:
@@ -170,7 +170,7 @@ def _inertia(factor: float) -> Change:
             assert e.rigid_body_torque_nm is not None
             step, q = float(np.median(np.diff(e.time_s))), e.position_rad
             low_pass = LowPass.at(1.0 / step)
-            accelerations.append(np.gradient(np.gradient(q, step), step))
+            accelerations.append(np.gradient(np.gradient(low_pass(q) if filtered else q, step), step))
             own = [accelerations[-1], np.cos(q), np.sin(q), np.ones_like(q), e.rigid_body_torque_nm]
             tables.append(low_pass(np.stack(own, axis=1))[10:-10])
         table = np.concatenate(tables)
@@ -285,6 +285,7 @@ VARIANTS: dict[str, Variant] = {
     },
     **{f"rigid body x {f:g}": Variant(_rigid(f), LOADS) for f in (0.9, 1.1, 1.2)},
     **{f"inertia believed x {f:g}": Variant(_inertia(f), ("inertia_error",)) for f in (0.5, 2.0)},
+    "inertia believed x 2, filtered": Variant(_inertia(2.0, filtered=True), ("inertia_error",)),
     "a payload": Variant(_torque(_load(0.5)), LOADS),
     "a payload at the tip": Variant(_at_the_tip(0.5), LOADS),
     "a payload in judged logs": Variant(_torque(_load(0.5), lambda e: e.validation), None),
