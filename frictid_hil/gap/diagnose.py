@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from frictid_hil.gap.borne_out import BorneOut, Loop, borne_out
+from frictid_hil.gap.both_ways import FAIR_SHARE, half_of_it
 from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, below_first_pair
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
@@ -31,6 +32,7 @@ from frictid_hil.gap.reading import (
 )
 from frictid_hil.gap.told import told
 from frictid_hil.gap.verdict import (
+    DOUBTED,
     HALF,
     LISTED,
     REMAINS,
@@ -44,6 +46,7 @@ from frictid_hil.gap.verdict import (
 )
 from frictid_hil.simulation.effects import all_effects
 
+HALF_OF_IT = "one cause alone takes half of the power of the gap off recordings that did not fit it, both ways round"
 UNDECIDED = 0.5  # most that is claimed of causes that a motion or the lack of a second log cannot tell apart
 
 
@@ -135,9 +138,32 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
         if borne.told is not None:
             reasons["closed_loop"] = borne.told
             gaps = gaps_left(channels, said.named)
+    if alone := _half_of_it(joint, reading, said, gaps):
+        said = alone
+        gaps = gaps_left(channels, said.named)
+        reasons["rest"] = f"{HALF_OF_IT}, and the rest has no name"
     said = _cautious(said, reasons, any(r.experiment.validation for r in joint.logs))
     gaps = gaps if reading.along is None else [*gaps, *gaps_left([reading.along], said.named)]
     return told(joint, channels, gaps, said, reasons)
+
+
+def _half_of_it(joint: Prepared, reading: Reading, said: Verdict, gaps: Sequence[Closed]) -> Verdict | None:
+    """What one cause is plainly half of, in its channel and in the closed loop, although the rest has no name."""
+    if said.word != "unknown" or reading.sought or said.place.startswith("actuation") or not reading.channels:
+        return None
+    causes = half_of_it(reading.found, reading.channels[0].posterior.channel)
+    if joint.simulation is not None:
+        left = {f.effect: joint.simulation.gap_nm(told_numbers([f])) for f in causes}
+        before_nm, noise_nm = pooled(joint.simulation.bare, "torque_nm"), _noise_nm(joint.simulation, gaps)
+        most = (1.0 - FAIR_SHARE) ** 2 * (before_nm**2 - noise_nm**2)
+        causes = [f for f in causes if left[f.effect] ** 2 - noise_nm**2 <= most]
+    if not causes:
+        return None
+    if len(causes) == 1:
+        return Verdict("explained", (causes[0].at_most(DOUBTED),), said.place)
+    names = [f.effect for f in causes]
+    tied = (replace(f.at_most(TIED), rivals=tuple(n for n in names if n != f.effect)) for f in causes)
+    return Verdict("ambiguous", tuple(tied), said.place)
 
 
 def _open_along(reading: Reading) -> bool:

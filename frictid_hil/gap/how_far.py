@@ -76,9 +76,13 @@ def _half_width(left: Array, apart: Sequence[Array], step_s: float) -> float:
 
 
 def _without_generic(channel: Sampled, names: Collection[str]) -> list[Draw]:
-    """Draws of the commonest model less its generic functions: what a joint gets to which the causes are added."""
+    """Draws of the commonest model less its generic functions: what a joint gets to which the causes are added.
+
+    Where none is in the commonest one, of the commonest that holds any.
+    """
     posterior = channel.posterior
-    terms = Counter(draw.model.terms for draw in channel.draws).most_common(1)[0][0]
+    holding = [draw for draw in channel.draws if draw.model.effects.intersection(names)]
+    terms = Counter(draw.model.terms for draw in holding or channel.draws).most_common(1)[0][0]
     causes = tuple(t for t in terms if posterior.channel.candidates[t].effect in names)
     return posterior.draws([posterior.model(causes)], FEW)
 
