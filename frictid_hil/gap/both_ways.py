@@ -39,7 +39,8 @@ def half_of_it(found: Sequence[Finding], channel: Channel) -> list[Finding]:
 def taken_both_ways(channel: Channel) -> dict[str, float]:
     """By cause: share of the RMS of logs that did not fit it which it takes off alone, the smaller of both ways.
 
-    Beside it stands, with and without it, what the belief's tolerances allow. Empty where one role has no logs.
+    Beside it stands, with and without it, what tolerances of the belief allow, but not the one that it is an error of.
+    Empty where one role has no logs.
     """
     roles = [[log for log in channel.logs if log.validation is role] for role in (False, True)]
     if not all(roles):
@@ -48,12 +49,15 @@ def taken_both_ways(channel: Channel) -> dict[str, float]:
     stretch = max(1.0, MEMORY_S[-1] / channel.step_s)  # rows that tell as much as one: what is left is slow
     shares: list[dict[str, float]] = []
     for fitted, judged in ((one, other), (other, one)):
-        _, before = _left(fitted, judged, channel.nuisances, stretch)
+        before: dict[str, float] = {}
         best: dict[str, tuple[float, float]] = {}
         for term in (t for t in channel.candidates if not t.effect.startswith(FAMILY)):
-            left = _left(fitted, judged, (*channel.nuisances, term), stretch)
+            beside = [n for n in channel.nuisances if n.effect != term.effect or n.shape]
+            if term.effect not in before:
+                before[term.effect] = _left(fitted, judged, beside, stretch)[1]
+            left = _left(fitted, judged, (*beside, term), stretch)
             best[term.effect] = min(best.get(term.effect, left), left)
-        shares.append({effect: 1.0 - after / before for effect, (_, after) in best.items()})
+        shares.append({effect: 1.0 - after / before[effect] for effect, (_, after) in best.items()})
     return {effect: min(share[effect] for share in shares) for effect in shares[0]}
 
 

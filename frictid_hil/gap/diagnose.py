@@ -149,7 +149,7 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
 
 def _half_of_it(joint: Prepared, reading: Reading, said: Verdict, gaps: Sequence[Closed]) -> Verdict | None:
     """What one cause is plainly half of, in its channel and in the closed loop, although the rest has no name."""
-    if said.word != "unknown" or reading.sought or said.place.startswith("actuation") or not reading.channels:
+    if said.word != "unknown" or reading.sought or not reading.channels:
         return None
     causes = half_of_it(reading.found, reading.channels[0].posterior.channel)
     if joint.simulation is not None:
