@@ -141,7 +141,8 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     if alone := _half_of_it(joint, reading, said, gaps):
         said = alone
         gaps = gaps_left(channels, said.named)
-        reasons["rest"] = f"{HALF_OF_IT}, and the rest has no name"
+        reasons["rest"] = f"{HALF_OF_IT}; the rest lives in: {said.place}"
+        reasons.pop("closed_loop", None)  # that was of causes which are named no more
     said = _cautious(said, reasons, any(r.experiment.validation for r in joint.logs))
     gaps = gaps if reading.along is None else [*gaps, *gaps_left([reading.along], said.named)]
     return told(joint, channels, gaps, said, reasons)

@@ -53,7 +53,7 @@ def told(
         },
         next_experiment=_next(said, experiments.nominal, logs, channels),
         reasons=reasons,
-        summary=_summary(experiments.name, said, lives(places), gaps, reasons.get("closed_loop")),
+        summary=_summary(experiments.name, said, lives(places), gaps, reasons),
         model=replay.model(effects if applied else {}) if replay is not None else None,
         candidate=replay.model(effects) if replay is not None else None,
         held_out=held_out(plant) if plant is not None else {},
@@ -135,7 +135,7 @@ def _next(
     return next_experiment(first.effect, others[0], nominal, logs, of_torque)
 
 
-def _summary(name: str, said: Verdict, there: str, gaps: Sequence[Closed], loop: str | None) -> str:
+def _summary(name: str, said: Verdict, there: str, gaps: Sequence[Closed], reasons: Mapping[str, str]) -> str:
     if said.word == "none":
         return f"{name}: no gap beyond noise and what counts as none."
     least = TIED if said.word == "ambiguous" else EVEN  # what stands for one another is told together
@@ -147,10 +147,11 @@ def _summary(name: str, said: Verdict, there: str, gaps: Sequence[Closed], loop:
         return f"{name}: {place}{part}lives in {said.place}, and no known effect explains it."
     if said.word == "ambiguous":
         return f"{name}: {place}{effects}; these recordings cannot decide."
-    if loop is not None:
+    if (loop := reasons.get("closed_loop")) is not None:
         return f"{name}: {place}{effects}; {loop}."
     told = max(gaps, key=lambda gap: gap.before / gap.floor)
     return (
         f"{name}: {place}{effects}; the gap of the {told.channel} falls from {told.before:.3g} to {told.after:.3g} "
-        f"({told.low:.3g} to {told.high:.3g}; noise alone {told.floor:.3g}) on recordings not used for fitting."
+        f"({told.low:.3g} to {told.high:.3g}; noise alone {told.floor:.3g}) on recordings not used for fitting"
+        f"{', and the rest has no name' if 'rest' in reasons else ''}."
     )

@@ -1,0 +1,145 @@
+"""What one cause alone takes off recordings that did not fit it, and when it is named for that."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from frictid_hil.gap.both_ways import FAIR_SHARE, half_of_it, taken_both_ways
+from frictid_hil.gap.channel import FAMILY, Channel, Rows, Term
+from frictid_hil.gap.diagnose import _half_of_it
+from frictid_hil.gap.diagnosis import Value
+from frictid_hil.gap.findings import Finding
+from frictid_hil.gap.how_far import Closed
+from frictid_hil.gap.verdict import DOUBTED, TIED, Verdict
+
+ROWS, STEP_S = 4000, 0.01
+LOAD, LEVEL, RIPPLE = "load_dependent_friction", "friction_level_error", "torque_ripple"
+
+
+def term(effect: str, column: int, deviation: float = 1.0, mean: float = 0.0) -> Term:
+    return Term(effect, {}, (column,), np.array([mean]), np.array([deviation]))
+
+
+def channel(
+    made: dict[bool, np.ndarray],  # what is in the residual of each role beside white noise: strengths of the columns
+    *,
+    alike: float = 0.0,  # correlation of the second column with the first
+    nuisances: tuple[Term, ...] = (),
+) -> Channel:
+    """Two roles of one log each, three columns; the third is what has no name. 10 is the size of all."""
+    random, logs = np.random.default_rng(7), []
+    for role, strengths in made.items():
+        x = random.standard_normal((ROWS, 3))
+        x[:, 1] = alike * x[:, 0] + np.sqrt(1.0 - alike**2) * x[:, 1]
+        y = x @ strengths + 0.01 * random.standard_normal(ROWS)
+        logs.append(Rows(f"log {role}", role, 0.0, y, x, np.zeros(ROWS), np.ones(ROWS, dtype=bool)))
+    candidates = (term(LOAD, 0, 10.0), term(RIPPLE, 1, 10.0), term(FAMILY + "position", 2, 10.0))
+    return Channel("plant", STEP_S, tuple(logs), nuisances, candidates, 1.0, 20.0)
+
+
+def both(*strengths: float) -> dict[bool, np.ndarray]:
+    return {role: np.array(strengths) for role in (False, True)}
+
+
+def finding(effect: str, chance: float = 0.9) -> Finding:
+    return Finding(effect, chance, chance, 2.0, 0.9, {"share": Value(0.1, 0.05, 0.15)}, (), "plant")
+
+
+def test_a_cause_takes_off_its_part_of_the_power_whatever_the_rest_is() -> None:
+    taken = taken_both_ways(channel(both(1.3, 0.0, 1.0)))
+    assert taken[LOAD] == pytest.approx(1.0 - 1.0 / np.hypot(1.3, 1.0), abs=0.03)
+    assert taken[RIPPLE] == pytest.approx(0.0, abs=0.02)
+    assert FAMILY + "position" not in taken
+
+
+def test_what_one_role_alone_holds_is_taken_off_one_way_and_put_on_the_other() -> None:
+    only_judged = {False: np.array([0.0, 0.0, 1.0]), True: np.array([3.0, 0.0, 1.0])}
+    assert taken_both_ways(channel(only_judged))[LOAD] < 0.05
+    opposite = {False: np.array([-2.0, 0.0, 1.0]), True: np.array([2.0, 0.0, 1.0])}
+    assert taken_both_ways(channel(opposite))[LOAD] < -0.5
+
+
+def test_a_tolerance_hides_another_cause_and_not_the_error_that_it_is_of() -> None:
+    made = both(1.5, 0.0, 1.0)
+    other = taken_both_ways(channel(made, nuisances=(term(LEVEL, 0, 3.0),)))
+    assert other[LOAD] == pytest.approx(0.0, abs=0.02)
+    own = taken_both_ways(channel(made, nuisances=(term(LOAD, 0, 3.0),)))
+    assert own[LOAD] > 0.4
+
+
+def test_a_cause_far_beyond_its_prior_is_not_taken_for_what_it_may_not_be() -> None:
+    """The residual is slow, so that its rows tell little: a tolerance is worth more than a few of them."""
+    narrow = replace(channel(both(1.5, 0.0, 1.0)), candidates=(term(LOAD, 0, 1e-3),))
+    assert taken_both_ways(narrow)[LOAD] < 0.05
+
+
+def test_recordings_of_one_role_say_nothing_both_ways() -> None:
+    one = channel(both(1.3, 0.0, 1.0))
+    alone = replace(one, logs=one.logs[:1])
+    assert taken_both_ways(alone) == {} and half_of_it([finding(LOAD)], alone) == []
+
+
+@pytest.mark.parametrize(("strength", "named"), [(1.2, [LOAD]), (0.8, [])])
+def test_a_cause_is_named_from_half_of_the_power_on(strength: float, named: list[str]) -> None:
+    assert pytest.approx(0.293, abs=0.001) == FAIR_SHARE
+    assert [f.effect for f in half_of_it([finding(LOAD)], channel(both(strength, 0.0, 1.0)))] == named
+
+
+def test_causes_that_least_squares_cannot_tell_apart_tie_and_the_likelier_comes_first() -> None:
+    alike = channel(both(1.5, 0.0, 0.8), alike=0.999)
+    assert [f.effect for f in half_of_it([finding(LOAD, 0.3), finding(RIPPLE, 0.9)], alike)] == [RIPPLE, LOAD]
+    assert [f.effect for f in half_of_it([finding(LOAD, 0.9), finding(RIPPLE, 0.1)], alike)] == [LOAD]
+
+
+def test_a_likely_cause_is_not_named_where_an_unlikely_one_takes_off_more() -> None:
+    made = channel(both(2.0, 0.0, 1.0), alike=0.9)
+    assert half_of_it([finding(RIPPLE)], made) == []
+
+
+NONE_SAID = Verdict("unknown", (), "plant: position")
+
+
+def joint(left_nm: dict[str, float] | None) -> Any:
+    """A joint whose closed loop, if there is one, has a gap of 1 and leaves so much of it with each cause."""
+    if left_nm is None:
+        return SimpleNamespace(simulation=None)
+    return SimpleNamespace(
+        simulation=SimpleNamespace(bare={}, noise_nm=0.1, gap_nm=lambda effects: left_nm[next(iter(effects))])
+    )
+
+
+def reading(found: list[Finding], one: Channel) -> Any:
+    return SimpleNamespace(found=found, sought=(), channels=[SimpleNamespace(posterior=SimpleNamespace(channel=one))])
+
+
+@pytest.mark.parametrize(("left_nm", "word"), [(None, "explained"), ({LOAD: 0.6}, "explained"), ({LOAD: 0.8}, None)])
+def test_the_closed_loop_has_to_bear_it_out(
+    left_nm: dict[str, float] | None, word: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("frictid_hil.gap.diagnose.pooled", lambda bare, what: 1.0)
+    gaps = [Closed("plant", 3.0, 3.0, 2.0, 4.0, 1.0)]
+    said = _half_of_it(joint(left_nm), reading([finding(LOAD, 0.99)], channel(both(1.5, 0.0, 1.0))), NONE_SAID, gaps)
+    assert (said.word if said is not None else None) == word
+    if said is not None:
+        assert [(f.effect, f.confidence) for f in said.named] == [(LOAD, DOUBTED)]
+
+
+def test_two_that_tie_are_ambiguous_and_each_says_so_of_the_other() -> None:
+    alike = channel(both(1.5, 0.0, 0.8), alike=0.999)
+    said = _half_of_it(joint(None), reading([finding(LOAD, 0.9), finding(RIPPLE, 0.8)], alike), NONE_SAID, [])
+    assert said is not None and said.word == "ambiguous"
+    assert [(f.effect, f.confidence, f.rivals) for f in said.named] == [
+        (LOAD, TIED, (RIPPLE,)),
+        (RIPPLE, TIED, (LOAD,)),
+    ]
+
+
+def test_what_is_explained_already_stays() -> None:
+    made = reading([finding(LOAD)], channel(both(1.5, 0.0, 1.0)))
+    for word in ("none", "explained", "ambiguous"):
+        assert _half_of_it(joint(None), made, Verdict(word, ()), []) is None
