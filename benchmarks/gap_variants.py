@@ -3,7 +3,8 @@
 The same recordings seen otherwise (mirrored, in another unit, every second row, in another order, half of the logs, a
 log at rest beside them) must have the same first cause. Recordings with something added that has a name (a torque
 constant, a load, cogging, a level of friction, a delay, play) must have that name, or ``unknown``; with pushes,
-``unknown``. Prints one line per answer that is not so, and the counts. ``--only WORD`` takes variants or sets with
+``unknown``. A cause of ``BESIDE`` times the gap that was there must be named or ``unknown``, and how often it is named
+is counted. Prints one line per answer that is not so, and the counts. ``--only WORD`` takes variants or sets with
 that word in their name; ``--every K`` takes one set in K.
 """
 
@@ -31,6 +32,7 @@ from frictid_hil.gap.sanity import completed
 LINKS_M = (0.3, 0.2)  # lengths of the double pendulum's links
 PLAIN = 2.0
 """Size of what is added over the gap that was there, from which on it must be named."""
+BESIDE = 1.3  # size of a cause over the gap of the machine's own that it stands beside: it is 63 % of the power
 SURE, FALSE_CLEAR = 0.9, 3.0
 TORQUE = ("torque_nm", "rigid_body_torque_nm", "torque_demand_nm")
 Change = Callable[[ExperimentSet], ExperimentSet | None]
@@ -132,6 +134,36 @@ def _with_torque(e: Experiment, added: Added) -> Experiment:
     velocity = LowPass.at(1.0 / step)(np.gradient(e.position_rad, step))
     assert e.torque_nm is not None
     return replace(e, torque_nm=e.torque_nm + added(e, velocity, np.gradient(velocity, step)))
+
+
+def _beside(added: Added) -> Change:
+    """A cause as large as ``BESIDE`` of the gap that is there."""
+
+    def change(s: ExperimentSet) -> ExperimentSet | None:
+        one = _torque(added)(s)
+        if one is None or not (size := added_over_gap(s, one)) > 0.0:
+            return None
+        return _torque(lambda e, velocity, acceleration: BESIDE / size * added(e, velocity, acceleration))(s)
+
+    return change
+
+
+def _with_the_load(e: Experiment, velocity: Array, acceleration: Array) -> Array:
+    load = e.rigid_body_torque_nm if e.rigid_body_torque_nm is not None else e.torque_nm
+    assert load is not None
+    torque: Array = _direction(velocity) * np.abs(load)
+    return torque
+
+
+def _harder_one_way(e: Experiment, velocity: Array, acceleration: Array) -> Array:
+    torque: Array = np.abs(_direction(velocity)) + np.abs(velocity) / rms(velocity)
+    return torque
+
+
+def _direction(velocity: Array) -> Array:
+    """Of the motion; through 0 within a twentieth of its usual speed."""
+    direction: Array = np.tanh(velocity / (0.05 * rms(velocity)))
+    return direction
 
 
 def _level(share: float) -> Change:
@@ -294,6 +326,11 @@ VARIANTS: dict[str, Variant] = {
     **{f"cogging, {c} a turn": Variant(_torque(_cogging(c, 0.3)), ("torque_ripple",)) for c in (12, 37, 72, 90)},
     **{f"friction {100 * s:+.0f} %": Variant(_level(s), CURVES) for s in (-0.2, -0.1, 0.1, 0.2)},
     **{f"later by {1e3 * s:g} ms": Variant(_later(s), ("torque_delay", "electrical_lag")) for s in (0.02, 0.06)},
+    "friction with the load beside the gap": Variant(
+        _beside(_with_the_load), ("load_dependent_friction", "directional_efficiency")
+    ),
+    "asymmetry beside the gap": Variant(_beside(_harder_one_way), ("direction_asymmetry",)),
+    "inertia beside the gap": Variant(_beside(lambda e, v, a: a), ("inertia_error",)),
     "play": Variant(_with_play, ("backlash", "torque_delay")),
 }
 
@@ -403,6 +440,9 @@ def main() -> int:
             size = f"added {a.stands_out:.2g}"
             print(a.name, size, f"{before} -> {after}", a.told[:3], *marks, sep=" | ", flush=True)
     counts = [sum(getattr(a, what) for a in found) for what in ("false_clear", "sure_and_wrong", "missed")]
+    beside = [a for a in found if "beside the gap" in a.name]
+    named = sum(_first(a.after) in (a.variant.causes or ()) for a in beside)
+    print(f"{named} of {len(beside)} causes named that stand beside a gap")
     print(f"{len(found)} answers: {counts[0]} false none, {counts[1]} sure and wrong, {counts[2]} missed")
     return 0
 

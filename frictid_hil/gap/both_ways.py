@@ -9,35 +9,76 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, Channel, Rows, Term
-from frictid_hil.gap.findings import Finding
-from frictid_hil.gap.posterior import MEMORY_S
+from frictid_hil.gap.diagnosis import Value
+from frictid_hil.gap.findings import Finding, read_numbers
+from frictid_hil.gap.how_far import Closed, closed_with
+from frictid_hil.gap.posterior import MEMORY_S, Posterior, form_of
 
 FAIR_SHARE = 1.0 - math.sqrt(0.5)
 """Share of a gap's RMS that a cause takes off, from which on it is half of its power: more than all else together."""
 TIE = 0.9  # share over that of the best, from which on least squares cannot tell two causes apart
 LIKELY = 0.25  # chance below which a cause is no cause, whatever it takes off
 ROUNDS = 4  # of fitting the noise that weighs tolerances against recordings
+DRAWS = 200  # of coefficients, from which intervals are read: an end is known to a tenth of a one-sigma
 
 
-def half_of_it(found: Sequence[Finding], channel: Channel) -> list[Finding]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """One cause beside what tolerances allow, by least squares under their priors."""
+
+    term: Term  # the cause, its coefficients last
+    at: np.ndarray  # numbers of all columns, shape (k,)
+    mean: Array  # their coefficients, shape (k,)
+    root: Array  # of the coefficients' covariance, shape (k, k)
+    left: float  # RMS of the logs that were fitted
+    left_over: float  # RMS of the others
+    taken: float = 0.0  # share of their RMS that the cause alone takes off
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Half:
+    """A cause that alone is half of a channel's gap."""
+
+    cause: Finding  # with the numbers of this fit
+    gap: Closed  # what it leaves
+
+
+def half_of_it(found: Sequence[Finding], posterior: Posterior) -> list[Half]:
     """Causes of which each alone is half of a channel's gap, both ways round: one, those that tie with it, or none.
 
     The likeliest comes first.
     """
     likely = [f for f in found if f.chance >= LIKELY and f.parameters]
-    taken = taken_both_ways(channel) if likely else {}
-    least = max(FAIR_SHARE, TIE * max(taken.values(), default=0.0))
-    tied = [f for f in likely if taken.get(f.effect, 0.0) >= least]
-    return sorted(tied, key=lambda f: (-f.chance, -taken[f.effect]))
+    fits = both_ways(posterior.channel) if likely else {}
+    least = max(FAIR_SHARE, TIE * max((fit.taken for fit in fits.values()), default=0.0))
+    tied = [(f, fits[f.effect]) for f in likely if f.effect in fits and fits[f.effect].taken >= least]
+    return [_half(f, fit, posterior) for f, fit in sorted(tied, key=lambda one: (-one[0].chance, -one[1].taken))]
 
 
-def taken_both_ways(channel: Channel) -> dict[str, float]:
-    """By cause: share of the RMS of logs that did not fit it which it takes off alone, the smaller of both ways.
+def _half(cause: Finding, fit: Fit, posterior: Posterior) -> Half:
+    """A cause with the numbers of its fit; no joint is quite as its formula, which widens their intervals."""
+    random = np.random.default_rng(0)
+    drawn = fit.mean + random.standard_normal((DRAWS, fit.mean.size)) @ fit.root.T
+    forms = 1.0 + form_of(cause.effect) * random.standard_normal(DRAWS)
+    own = len(fit.term.columns)
+    told = [read_numbers(cause.effect, posterior.channel, fit.term, values[-own:]) for values in (fit.mean, *drawn)]
+    numbers = {}
+    for name, value in told[0].items():
+        low, high = np.quantile([f * one[name] for f, one in zip(forms, told[1:], strict=True)], [0.025, 0.975])
+        numbers[name] = Value(value, float(low), float(high))
+    width = posterior.channel.logs[0].x.shape[1]
+    every = [np.bincount(fit.at, values, width).astype(np.float64) for values in drawn]
+    return Half(replace(cause, parameters=numbers), closed_with(posterior, every))
+
+
+def both_ways(channel: Channel) -> dict[str, Fit]:
+    """By cause: its fit to the identification logs, ``taken`` the smaller share of both ways round.
 
     Beside it stands, with and without it, what tolerances of the belief allow, but not the one that it is an error of.
     Empty where one role has no logs.
@@ -47,18 +88,23 @@ def taken_both_ways(channel: Channel) -> dict[str, float]:
         return {}
     one, other = (_products(logs, channel.level_free) for logs in roles)
     stretch = max(1.0, MEMORY_S[-1] / channel.step_s)  # rows that tell as much as one: what is left is slow
-    shares: list[dict[str, float]] = []
-    for fitted, judged in ((one, other), (other, one)):
-        before: dict[str, float] = {}
-        best: dict[str, tuple[float, float]] = {}
-        for term in (t for t in channel.candidates if not t.effect.startswith(FAMILY)):
-            beside = [n for n in channel.nuisances if n.effect != term.effect or n.shape]
-            if term.effect not in before:
-                before[term.effect] = _left(fitted, judged, beside, stretch)[1]
-            left = _left(fitted, judged, (*beside, term), stretch)
-            best[term.effect] = min(best.get(term.effect, left), left)
-        shares.append({effect: 1.0 - after / before[effect] for effect, (_, after) in best.items()})
-    return {effect: min(share[effect] for share in shares) for effect in shares[0]}
+    ways = [_one_way(channel, fitted, judged, stretch) for fitted, judged in ((one, other), (other, one))]
+    return {effect: replace(fit, taken=min(way[effect].taken for way in ways)) for effect, fit in ways[0].items()}
+
+
+def _one_way(channel: Channel, fitted: tuple[Array, int], judged: tuple[Array, int], stretch: float) -> dict[str, Fit]:
+    """By cause: the fit of that shape which leaves least of the fitted logs."""
+    nothing = Term("", {}, (), np.zeros(0), np.zeros(0))
+    before: dict[str, float] = {}
+    best: dict[str, Fit] = {}
+    for term in (t for t in channel.candidates if not t.effect.startswith(FAMILY)):
+        beside = [n for n in channel.nuisances if n.effect != term.effect or n.shape]
+        if term.effect not in before:
+            before[term.effect] = _fit(fitted, judged, beside, nothing, stretch).left_over
+        fit = _fit(fitted, judged, beside, term, stretch)
+        if term.effect not in best or fit.left < best[term.effect].left:
+            best[term.effect] = replace(fit, taken=1.0 - fit.left_over / before[term.effect])
+    return best
 
 
 def _products(logs: Sequence[Rows], level_free: bool) -> tuple[Array, int]:
@@ -69,22 +115,26 @@ def _products(logs: Sequence[Rows], level_free: bool) -> tuple[Array, int]:
     return table.T @ table, table.shape[0]
 
 
-def _left(
-    fitted: tuple[Array, int], judged: tuple[Array, int], terms: Sequence[Term], stretch: float
-) -> tuple[float, float]:
-    """RMS that terms, fitted on one role under their priors, leave (of that role, of the other one)."""
-    at = np.concatenate([np.zeros(0, dtype=int), *(np.array(term.columns, dtype=int) for term in terms)])
-    deviation = np.maximum(np.concatenate([np.zeros(0), *(term.deviation for term in terms)]), 1e-300)
-    mean = np.concatenate([np.zeros(0), *(term.mean for term in terms)]) / deviation
+def _fit(
+    fitted: tuple[Array, int], judged: tuple[Array, int], beside: Sequence[Term], term: Term, stretch: float
+) -> Fit:
+    """Terms fitted on one role; ``stretch`` rows tell as much as one."""
+    terms = (*beside, term)
+    at = np.concatenate([np.array(t.columns, dtype=int) for t in terms])
+    deviation = np.maximum(np.concatenate([t.deviation for t in terms]), 1e-300)
+    expected = np.concatenate([t.mean for t in terms]) / deviation
     gram, rows = fitted
     inner = gram[np.ix_(at, at)] * deviation[:, None] * deviation
     right = gram[at, -1] * deviation
-    variance, values = gram[-1, -1] / max(rows, 1) + 1e-300, mean
+    variance, values = gram[-1, -1] / max(rows, 1) + 1e-300, expected
     for _ in range(ROUNDS):
         ridge = stretch * variance
-        values = np.linalg.solve(inner + ridge * np.eye(at.size), right + ridge * mean)
+        values = np.linalg.solve(inner + ridge * np.eye(at.size), right + ridge * expected)
         variance = _mean_square(fitted, at, deviation * values)
-    return math.sqrt(variance), math.sqrt(_mean_square(judged, at, deviation * values))
+    spread = np.linalg.inv(inner / (stretch * variance) + np.eye(at.size))
+    root = deviation[:, None] * np.linalg.cholesky(spread + 1e-14 * np.eye(at.size))
+    left_over = math.sqrt(_mean_square(judged, at, deviation * values))
+    return Fit(term, at, deviation * values, root, math.sqrt(variance), left_over)
 
 
 def _mean_square(products: tuple[Array, int], at: np.ndarray, values: Array) -> float:

@@ -138,9 +138,8 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
         if borne.told is not None:
             reasons["closed_loop"] = borne.told
             gaps = gaps_left(channels, said.named)
-    if alone := _half_of_it(joint, reading, said, gaps):
-        said = alone
-        gaps = gaps_left(channels, said.named)
+    if half := _half_of_it(joint, reading, said, gaps):
+        said, gaps = half
         reasons["rest"] = f"{HALF_OF_IT}; the rest lives in: {said.place}"
         reasons.pop("closed_loop", None)  # that was of causes which are named no more
     said = _cautious(said, reasons, any(r.experiment.validation for r in joint.logs))
@@ -148,23 +147,28 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     return told(joint, channels, gaps, said, reasons)
 
 
-def _half_of_it(joint: Prepared, reading: Reading, said: Verdict, gaps: Sequence[Closed]) -> Verdict | None:
+def _half_of_it(
+    joint: Prepared, reading: Reading, said: Verdict, gaps: Sequence[Closed]
+) -> tuple[Verdict, list[Closed]] | None:
     """What one cause is plainly half of, in its channel and in the closed loop, although the rest has no name."""
     if said.word != "unknown" or reading.sought or not reading.channels:
         return None
-    causes = half_of_it(reading.found, reading.channels[0].posterior.channel)
+    halves = half_of_it(reading.found, reading.channels[0].posterior)
     if joint.simulation is not None:
-        left = {f.effect: joint.simulation.gap_nm(told_numbers([f])) for f in causes}
         before_nm, noise_nm = pooled(joint.simulation.bare, "torque_nm"), _noise_nm(joint.simulation, gaps)
         most = (1.0 - FAIR_SHARE) ** 2 * (before_nm**2 - noise_nm**2)
-        causes = [f for f in causes if left[f.effect] ** 2 - noise_nm**2 <= most]
-    if not causes:
+        left = [joint.simulation.gap_nm(told_numbers([half.cause])) for half in halves]
+        halves = [half for half, nm in zip(halves, left, strict=True) if nm**2 - noise_nm**2 <= most]
+    if not halves:
         return None
+    first, causes = halves[0], [half.cause for half in halves]
     if len(causes) == 1:
-        return Verdict("explained", (causes[0].at_most(DOUBTED),), said.place)
-    names = [f.effect for f in causes]
-    tied = (replace(f.at_most(TIED), rivals=tuple(n for n in names if n != f.effect)) for f in causes)
-    return Verdict("ambiguous", tuple(tied), said.place)
+        told = Verdict("explained", (first.cause.at_most(DOUBTED),), said.place)
+    else:
+        names = [f.effect for f in causes]
+        tied = (replace(f.at_most(TIED), rivals=tuple(n for n in names if n != f.effect)) for f in causes)
+        told = Verdict("ambiguous", tuple(tied), said.place)
+    return told, [first.gap, *gaps_left(reading.channels[1:], told.named)]
 
 
 def _open_along(reading: Reading) -> bool:

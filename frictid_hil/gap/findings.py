@@ -371,12 +371,12 @@ def parameters(effect: str, channel: Sampled, k: int) -> dict[str, float]:
         return {}
     posterior = channel.posterior
     if _opposed([(term, values) for term, values in found if term.shape]):
-        return _read(effect, posterior.channel, *_nearest(effect, channel, found))
+        return read_numbers(effect, posterior.channel, *_nearest(effect, channel, found))
     told, form = _between(found), all_effects()[effect].inverse
     # Between two lines over position there is none: each has coefficients of its own.
     apart = form is not None and not form.continuous and len(told.columns) > 1
     alike = [v for t, v in found if v.size == len(told.columns) and not (apart and t.shape != told.shape)]
-    return _read(effect, posterior.channel, told, np.sum(alike, axis=0))
+    return read_numbers(effect, posterior.channel, told, np.sum(alike, axis=0))
 
 
 def _opposed(shaped: Sequence[tuple[Term, Array]]) -> bool:
@@ -410,7 +410,8 @@ def _between(found: Sequence[tuple[Term, Array]]) -> Term:
     return replace(loudest, shape=mean)
 
 
-def _read(effect: str, channel: Channel, term: Term, values: Array) -> dict[str, float]:
+def read_numbers(effect: str, channel: Channel, term: Term, values: Array) -> dict[str, float]:
+    """The effect's parameters that a term's coefficients in a channel stand for."""
     form = all_effects()[effect]
     if channel.of_the_joint and form.inverse is not None:
         return form.inverse.parameters(term.shape, values)

@@ -14,7 +14,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, Rows
 from frictid_hil.gap.findings import Sampled
 from frictid_hil.gap.forward import Replayed, pooled
-from frictid_hil.gap.posterior import Draw, joined
+from frictid_hil.gap.posterior import Draw, Posterior, joined
 from frictid_hil.gap.residuals import rms
 
 COLOUR = 2.0
@@ -43,10 +43,13 @@ class Closed:
 
 def closed(channel: Sampled, names: Collection[str]) -> Closed:
     """The gap of one channel without the named causes, and with them and what tolerances allow."""
-    posterior = channel.posterior
+    return closed_with(channel.posterior, [coefficients(channel, draw) for draw in _without_generic(channel, names)])
+
+
+def closed_with(posterior: Posterior, every: Sequence[Array]) -> Closed:
+    """The same with draws of coefficients of all the columns, (m,) each."""
     judged = posterior.channel.judged
     constant = posterior.channel.level_free
-    every = [coefficients(channel, draw) for draw in _without_generic(channel, names)]
     mean = np.mean(every, axis=0)
     left = _left(judged, mean, constant)
     apart = [_left(judged, theta, constant) - left for theta in every]
@@ -58,7 +61,7 @@ def closed(channel: Sampled, names: Collection[str]) -> Closed:
         math.sqrt(max(0.0, after**2 - half)),
         math.sqrt(after**2 + half),
         min(posterior.floor, COLOUR * posterior.channel.known_floor),
-        _appeared(channel, mean),
+        _appeared(posterior, mean),
     )
 
 
@@ -76,13 +79,9 @@ def _half_width(left: Array, apart: Sequence[Array], step_s: float) -> float:
 
 
 def _without_generic(channel: Sampled, names: Collection[str]) -> list[Draw]:
-    """Draws of the commonest model less its generic functions: what a joint gets to which the causes are added.
-
-    Where none is in the commonest one, of the commonest that holds any.
-    """
+    """Draws of the commonest model less its generic functions: what a joint gets to which the causes are added."""
     posterior = channel.posterior
-    holding = [draw for draw in channel.draws if draw.model.effects.intersection(names)]
-    terms = Counter(draw.model.terms for draw in holding or channel.draws).most_common(1)[0][0]
+    terms = Counter(draw.model.terms for draw in channel.draws).most_common(1)[0][0]
     causes = tuple(t for t in terms if posterior.channel.candidates[t].effect in names)
     return posterior.draws([posterior.model(causes)], FEW)
 
@@ -100,9 +99,8 @@ def _left(logs: Sequence[Rows], theta: Array, without_mean: bool) -> Array:
     return np.concatenate([part - np.mean(part) if without_mean else part for part in parts])
 
 
-def _appeared(channel: Sampled, theta: Array) -> tuple[str, float] | None:
+def _appeared(posterior: Posterior, theta: Array) -> tuple[str, float] | None:
     """The validation log, and the time in it, from which on the causes explain much less than elsewhere."""
-    posterior = channel.posterior
     fitted = [log for log in posterior.channel.logs if not log.validation]
     if not fitted or posterior.channel.level_free:
         return None

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from frictid_hil.gap.both_ways import FAIR_SHARE, half_of_it, taken_both_ways
+from frictid_hil.gap.both_ways import FAIR_SHARE, both_ways, half_of_it
 from frictid_hil.gap.channel import FAMILY, Channel, Rows, Term
 from frictid_hil.gap.diagnose import _half_of_it
 from frictid_hil.gap.diagnosis import Value
@@ -18,7 +18,7 @@ from frictid_hil.gap.how_far import Closed
 from frictid_hil.gap.verdict import DOUBTED, TIED, Verdict
 
 ROWS, STEP_S = 4000, 0.01
-LOAD, LEVEL, RIPPLE = "load_dependent_friction", "friction_level_error", "torque_ripple"
+LOAD, LEVEL, RIPPLE = "load_dependent_friction", "friction_level_error", "viscous_nonlinearity"
 
 
 def term(effect: str, column: int, deviation: float = 1.0, mean: float = 0.0) -> Term:
@@ -44,6 +44,18 @@ def channel(
 
 def both(*strengths: float) -> dict[bool, np.ndarray]:
     return {role: np.array(strengths) for role in (False, True)}
+
+
+def taken_both_ways(one: Channel) -> dict[str, float]:
+    return {effect: fit.taken for effect, fit in both_ways(one).items()}
+
+
+def named(found: list[Finding], one: Channel) -> list[str]:
+    return [half.cause.effect for half in half_of_it(found, posterior(one))]
+
+
+def posterior(one: Channel) -> Any:
+    return SimpleNamespace(channel=one, floor=0.01)
 
 
 def finding(effect: str, chance: float = 0.9) -> Finding:
@@ -81,24 +93,34 @@ def test_a_cause_far_beyond_its_prior_is_not_taken_for_what_it_may_not_be() -> N
 def test_recordings_of_one_role_say_nothing_both_ways() -> None:
     one = channel(both(1.3, 0.0, 1.0))
     alone = replace(one, logs=one.logs[:1])
-    assert taken_both_ways(alone) == {} and half_of_it([finding(LOAD)], alone) == []
+    assert taken_both_ways(alone) == {} and named([finding(LOAD)], alone) == []
 
 
-@pytest.mark.parametrize(("strength", "named"), [(1.2, [LOAD]), (0.8, [])])
-def test_a_cause_is_named_from_half_of_the_power_on(strength: float, named: list[str]) -> None:
+@pytest.mark.parametrize(("strength", "told"), [(1.2, [LOAD]), (0.8, [])])
+def test_a_cause_is_named_from_half_of_the_power_on(strength: float, told: list[str]) -> None:
     assert pytest.approx(0.293, abs=0.001) == FAIR_SHARE
-    assert [f.effect for f in half_of_it([finding(LOAD)], channel(both(strength, 0.0, 1.0)))] == named
+    assert named([finding(LOAD)], channel(both(strength, 0.0, 1.0))) == told
+
+
+def test_its_numbers_and_what_stays_are_those_of_the_fit() -> None:
+    (half,) = half_of_it([finding(LOAD)], posterior(channel(both(1.5, 0.0, 1.0))))
+    told = half.cause.parameters["linear_share"]
+    assert told.value == pytest.approx(1.5, rel=0.05)
+    assert told.low is not None and told.high is not None and told.low < 1.5 < told.high
+    assert half.gap.before == pytest.approx(np.hypot(1.5, 1.0), rel=0.05)
+    assert half.gap.after == pytest.approx(1.0, rel=0.05)
+    assert half.gap.low < half.gap.after < half.gap.high
 
 
 def test_causes_that_least_squares_cannot_tell_apart_tie_and_the_likelier_comes_first() -> None:
     alike = channel(both(1.5, 0.0, 0.8), alike=0.999)
-    assert [f.effect for f in half_of_it([finding(LOAD, 0.3), finding(RIPPLE, 0.9)], alike)] == [RIPPLE, LOAD]
-    assert [f.effect for f in half_of_it([finding(LOAD, 0.9), finding(RIPPLE, 0.1)], alike)] == [LOAD]
+    assert named([finding(LOAD, 0.3), finding(RIPPLE, 0.9)], alike) == [RIPPLE, LOAD]
+    assert named([finding(LOAD, 0.9), finding(RIPPLE, 0.1)], alike) == [LOAD]
 
 
 def test_a_likely_cause_is_not_named_where_an_unlikely_one_takes_off_more() -> None:
     made = channel(both(2.0, 0.0, 1.0), alike=0.9)
-    assert half_of_it([finding(RIPPLE)], made) == []
+    assert named([finding(RIPPLE)], made) == []
 
 
 NONE_SAID = Verdict("unknown", (), "plant: position")
@@ -114,7 +136,7 @@ def joint(left_nm: dict[str, float] | None) -> Any:
 
 
 def reading(found: list[Finding], one: Channel) -> Any:
-    return SimpleNamespace(found=found, sought=(), channels=[SimpleNamespace(posterior=SimpleNamespace(channel=one))])
+    return SimpleNamespace(found=found, sought=(), channels=[SimpleNamespace(posterior=posterior(one))])
 
 
 @pytest.mark.parametrize(("left_nm", "word"), [(None, "explained"), ({LOAD: 0.6}, "explained"), ({LOAD: 0.8}, None)])
@@ -124,19 +146,19 @@ def test_the_closed_loop_has_to_bear_it_out(
     monkeypatch.setattr("frictid_hil.gap.diagnose.pooled", lambda bare, what: 1.0)
     gaps = [Closed("plant", 3.0, 3.0, 2.0, 4.0, 1.0)]
     said = _half_of_it(joint(left_nm), reading([finding(LOAD, 0.99)], channel(both(1.5, 0.0, 1.0))), NONE_SAID, gaps)
-    assert (said.word if said is not None else None) == word
+    assert (said[0].word if said is not None else None) == word
     if said is not None:
-        assert [(f.effect, f.confidence) for f in said.named] == [(LOAD, DOUBTED)]
+        assert [(f.effect, f.confidence) for f in said[0].named] == [(LOAD, DOUBTED)]
+        assert said[1][0].after < 0.7 * said[1][0].before
 
 
 def test_two_that_tie_are_ambiguous_and_each_says_so_of_the_other() -> None:
     alike = channel(both(1.5, 0.0, 0.8), alike=0.999)
-    said = _half_of_it(joint(None), reading([finding(LOAD, 0.9), finding(RIPPLE, 0.8)], alike), NONE_SAID, [])
-    assert said is not None and said.word == "ambiguous"
-    assert [(f.effect, f.confidence, f.rivals) for f in said.named] == [
-        (LOAD, TIED, (RIPPLE,)),
-        (RIPPLE, TIED, (LOAD,)),
-    ]
+    both_told = [finding(LOAD, 0.9), finding(RIPPLE, 0.8)]
+    said = _half_of_it(joint(None), reading(both_told, alike), NONE_SAID, [])
+    assert said is not None and said[0].word == "ambiguous"
+    assert [(f.effect, f.rivals) for f in said[0].named] == [(LOAD, (RIPPLE,)), (RIPPLE, (LOAD,))]
+    assert {f.confidence for f in said[0].named} == {TIED}
 
 
 def test_what_is_explained_already_stays() -> None:

@@ -23,7 +23,11 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def benchmark() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("gap_real", ROOT / "benchmarks" / "gap_real.py")
+    return loaded("gap_real")
+
+
+def loaded(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
@@ -51,6 +55,16 @@ def test_the_second_joint_of_the_pendulum_has_a_gap_that_no_effect_closes(
     assert found.verdict == "unknown" and not found.causes
     # The best of them takes 5.2 % of the squares away, 2.6 % of the gap.
     assert min(found.held_out.values()) > -5.5
+
+
+@pytest.mark.slow
+def test_a_cause_beside_a_gap_of_the_machines_own_is_named_and_what_stays_is_told(benchmark: ModuleType) -> None:
+    added = loaded("gap_variants").VARIANTS["friction with the load beside the gap"]
+    found = diagnose(added.change(benchmark.double_pendulum(REAL, "c1", 2, False)))
+    assert found.verdict == "explained" and found.causes[0].effect == "load_dependent_friction"
+    assert found.causes[0].confidence < 0.9 and "rest" in found.reasons
+    assert found.after.inverse_nm is not None and found.before.inverse_nm is not None
+    assert 0.5 * found.before.inverse_nm < found.after.inverse_nm < 0.8 * found.before.inverse_nm
 
 
 @pytest.mark.slow
