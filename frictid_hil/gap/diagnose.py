@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from frictid_hil.gap.borne_out import BorneOut, Loop, borne_out
-from frictid_hil.gap.both_ways import FAIR_SHARE, half_of_it
+from frictid_hil.gap.both_ways import half_of_it
 from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, below_first_pair
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
@@ -150,13 +150,13 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
 def _half_of_it(
     joint: Prepared, reading: Reading, said: Verdict, gaps: Sequence[Closed]
 ) -> tuple[Verdict, list[Closed]] | None:
-    """What one cause is plainly half of, in its channel and in the closed loop, although the rest has no name."""
+    """What one cause is plainly half of, and closes the loop by half as any cause must, although the rest has no name."""
     if said.word != "unknown" or reading.sought or not reading.channels:
         return None
     halves = half_of_it(reading.found, reading.channels[0].posterior)
     if joint.simulation is not None:
         before_nm, noise_nm = pooled(joint.simulation.bare, "torque_nm"), _noise_nm(joint.simulation, gaps)
-        most = (1.0 - FAIR_SHARE) ** 2 * (before_nm**2 - noise_nm**2)
+        most = HALF**2 * (before_nm**2 - noise_nm**2)
         left = [joint.simulation.gap_nm(told_numbers([half.cause])) for half in halves]
         halves = [half for half, nm in zip(halves, left, strict=True) if nm**2 - noise_nm**2 <= most]
     if not halves:
