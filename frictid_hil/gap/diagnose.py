@@ -150,7 +150,7 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
 def _half_of_it(
     joint: Prepared, reading: Reading, said: Verdict, gaps: Sequence[Closed]
 ) -> tuple[Verdict, list[Closed]] | None:
-    """What one cause is plainly half of, and closes the loop by half as any cause must, although the rest has no name."""
+    """What one cause is plainly half of, although the rest has no name; it has to close the loop by half, as any."""
     if said.word != "unknown" or reading.sought or not reading.channels:
         return None
     halves = half_of_it(reading.found, reading.channels[0].posterior)
