@@ -70,8 +70,7 @@ def verdict(
     # What has no name in a demand that is a guess is the guess: there the closed loop tells what stays.
     guessed = [loop_judges and c.posterior.channel.between_rows for c in channels]
     telling = [(c, gap) for c, gap, guess in zip(channels, gaps, guessed, strict=True) if not guess]
-    generic = _root_sum([c.generic for c, _ in telling])
-    place = _place([c for c, _ in telling])
+    generic, place = _root_sum([c.generic for c, _ in telling]), _place([c for c, _ in telling])
     if any(f.where == READ_DIRECTLY for f in named):
         return Verdict("explained", named)
     told = any(f in missed for f in named)
