@@ -2,7 +2,8 @@
 
 The posterior weighs every band and every form, and calls a joint ``unknown`` whose gap it cannot put together. That a
 single cause is half of that gap may be plain all the same: fitted on the identification logs it takes it off the
-validation logs, and fitted on those it takes it off the others. What only looks like a cause hardly passes both.
+validation logs, and fitted on those it takes it off the others. What only looks like a cause hardly passes both, or
+takes off less than functions without a name do.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.channel import FAMILY, Channel, Rows, Term
+from frictid_hil.gap.channel import Channel, Rows, Term
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Finding, read_numbers
 from frictid_hil.gap.how_far import Closed, closed_with
@@ -22,7 +23,7 @@ from frictid_hil.gap.posterior import MEMORY_S, Posterior, form_of
 
 FAIR_SHARE = 1.0 - math.sqrt(0.5)
 """Share of a gap's RMS that a cause takes off, from which on it is half of its power: more than all else together."""
-TIE = 0.9  # share over that of the best, from which on least squares cannot tell two causes apart
+TIE = 0.9  # share over that of the best, functions without a name among them, from which on the two are told alike
 LIKELY = 0.25  # chance below which a cause is no cause, whatever it takes off
 ROUNDS = 4  # of fitting the noise that weighs tolerances against recordings
 DRAWS = 200  # of coefficients, from which intervals are read: an end is known to a tenth of a one-sigma
@@ -78,7 +79,7 @@ def _half(cause: Finding, fit: Fit, posterior: Posterior) -> Half:
 
 
 def both_ways(channel: Channel) -> dict[str, Fit]:
-    """By cause: its fit to the identification logs, ``taken`` the smaller share of both ways round.
+    """By cause or family of functions: its fit to the identification logs, ``taken`` the smaller share of both ways.
 
     Beside it stands, with and without it, what tolerances of the belief allow, but not the one that it is an error of.
     Empty where one role has no logs.
@@ -93,11 +94,11 @@ def both_ways(channel: Channel) -> dict[str, Fit]:
 
 
 def _one_way(channel: Channel, fitted: tuple[Array, int], judged: tuple[Array, int], stretch: float) -> dict[str, Fit]:
-    """By cause: the fit of that shape which leaves least of the fitted logs."""
+    """The same one way: of all shapes that fit which leaves least of the fitted logs."""
     nothing = Term("", {}, (), np.zeros(0), np.zeros(0))
     before: dict[str, float] = {}
     best: dict[str, Fit] = {}
-    for term in (t for t in channel.candidates if not t.effect.startswith(FAMILY)):
+    for term in channel.candidates:
         beside = [n for n in channel.nuisances if n.effect != term.effect or n.shape]
         if term.effect not in before:
             before[term.effect] = _fit(fitted, judged, beside, nothing, stretch).left_over

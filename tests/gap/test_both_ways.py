@@ -66,7 +66,7 @@ def test_a_cause_takes_off_its_part_of_the_power_whatever_the_rest_is() -> None:
     taken = taken_both_ways(channel(both(1.3, 0.0, 1.0)))
     assert taken[LOAD] == pytest.approx(1.0 - 1.0 / np.hypot(1.3, 1.0), abs=0.03)
     assert taken[RIPPLE] == pytest.approx(0.0, abs=0.02)
-    assert FAMILY + "position" not in taken
+    assert taken[FAMILY + "position"] == pytest.approx(1.0 - 1.3 / np.hypot(1.3, 1.0), abs=0.03)
 
 
 def test_what_one_role_alone_holds_is_taken_off_one_way_and_put_on_the_other() -> None:
@@ -121,6 +121,14 @@ def test_causes_that_least_squares_cannot_tell_apart_tie_and_the_likelier_comes_
 def test_a_likely_cause_is_not_named_where_an_unlikely_one_takes_off_more() -> None:
     made = channel(both(2.0, 0.0, 1.0), alike=0.9)
     assert named([finding(RIPPLE)], made) == []
+
+
+def test_a_cause_is_not_named_where_functions_without_a_name_take_off_more() -> None:
+    made = both(1.5, 0.0, 1.0)
+    one = channel(made)
+    curve = replace(one.candidates[2], columns=(0, 2), mean=np.zeros(2), deviation=np.full(2, 10.0))
+    assert named([finding(LOAD)], one) == [LOAD]
+    assert named([finding(LOAD)], replace(one, candidates=(*one.candidates[:2], curve))) == []
 
 
 NONE_SAID = Verdict("unknown", (), "plant: position")
