@@ -1,8 +1,9 @@
-"""Curves over speed that together make no more than an error of the believed curve are told as that error."""
+"""What the recordings do not tell apart from something plainer is told as that: curves over speed, losses of a gear."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -14,16 +15,85 @@ from frictid_hil.simulation.effects import all_effects
 SPEED = FAMILY + "velocity"  # functions of speed without a name
 CANCELS = 0.25
 """Power of what causes make together over that of the largest, below which they mostly cancel: half of its size."""
+ONE_PART = math.sqrt(0.5)  # share that is left of an effect of one part of two alike by what has equal parts
 CLEAR = 1.96  # one-sigmas of a belief from which on its error is a cause of its own: 95 %
 
 
-def plainest(posterior: Posterior, draw: Draw, gram: Array) -> Draw:
+def plainest(posterior: Posterior, draw: Draw, gram: Array, surer: float = 0.5) -> Draw:
+    """The draw with its causes told in the plainest way that their forms allow.
+
+    ``gram`` holds mean products of the channel's columns, shape (m, m). A chance is taken where it is ``surer`` than
+    this: over many draws, where each has another one, it is taken as often as it is worth.
+    """
+    return _plain_curves(posterior, _plain_parts(posterior, draw, gram, surer), gram)
+
+
+def _plain_parts(posterior: Posterior, draw: Draw, gram: Array, surer: float) -> Draw:
+    """The draw with the plainer effect in the place of one whose parts may as well be equal.
+
+    If they are equal, what the two effects make together is off the plainer one by the one-sigma of its form; if not,
+    by anything up to ``ONE_PART``. What is left has no name.
+    """
+    candidates = posterior.channel.candidates
+    for effect in sorted(draw.model.effects):
+        known = all_effects().get(effect)
+        plain = known.inverse.equal if known is not None and known.inverse is not None else ""
+        shapes = [t for t, one in enumerate(candidates) if plain and one.effect == plain]
+        parts = posterior.contributions(draw)
+        made = np.zeros(gram.shape[0])
+        for name in (effect, plain):
+            if name in parts:
+                np.add.at(made, *parts[name])
+        fits = [(t, *_nearest(made, candidates[t], gram)) for t in shapes]
+        left = {t: float(rest @ gram @ rest) for t, values, rest in fits if _allowed(candidates[t], values)}
+        best = min(left, key=lambda t: left[t], default=None)
+        if best is not None and _equal(left[best] / float(made @ gram @ made)) > surer:
+            _, values, rest = fits[shapes.index(best)]
+            kept = {t: part for t, part in _own(posterior, draw) if candidates[t].effect not in (effect, plain)}
+            draw = _with_terms(posterior, draw, {**kept, best: values}, rest)
+    return draw
+
+
+def _equal(off: float) -> float:
+    """Chance that parts are equal by the square of what that leaves, over that of what there is."""
+    odds = math.exp(-0.5 * off / FORM**2) * ONE_PART * math.sqrt(2.0 / math.pi) / FORM
+    return odds / (1.0 + odds)
+
+
+def _nearest(made: Array, term: Term, gram: Array) -> tuple[Array, Array]:
+    """(Coefficients of a term that come nearest to what coefficients of all columns make, what they leave of those)."""
+    at = np.array(term.columns)
+    values = np.linalg.lstsq(gram[np.ix_(at, at)], gram[at] @ made, rcond=None)[0]
+    rest = made.copy()
+    rest[at] -= values
+    return values, rest
+
+
+def _allowed(term: Term, values: Array) -> bool:
+    return bool(np.all((values[: term.bounded] >= term.least) & (values[: term.bounded] <= term.largest)))
+
+
+def _own(posterior: Posterior, draw: Draw) -> list[tuple[int, Array]]:
+    """The draw's candidates with their coefficients."""
+    parts = [values for _, values in by_term(posterior.terms(draw.model), draw.values)]
+    return list(zip(draw.model.terms, parts[len(posterior.channel.nuisances) :], strict=True))
+
+
+def _with_terms(posterior: Posterior, draw: Draw, kept: Mapping[int, Array], rest: Array) -> Draw:
+    """The draw with other candidates, and what they leave beside what has no name already."""
+    held = sum(len(term.columns) for term in posterior.channel.nuisances)
+    model = posterior.model(tuple(kept))
+    values = np.concatenate([draw.values[:held], *(kept[t] for t in model.terms)])
+    return Draw(model, draw.setting, values, rest if draw.unnamed is None else draw.unnamed + rest)
+
+
+def _plain_curves(posterior: Posterior, draw: Draw, gram: Array) -> Draw:
     """The draw with friction as a function of speed told in the plainest way that its forms allow.
 
     The form of each cause is right to a tenth of it. Where several curves, or some that mostly cancel, make together
     what an error of the believed curve makes, but for such a tenth, the recordings do not tell their shapes: the error
     is the cause, and what it leaves has no name. A tenth of large curves would show, though: no more is left than
-    stays hidden, or than has no name already. ``gram`` holds mean products of the channel's columns, shape (m, m).
+    stays hidden, or than has no name already.
     """
     terms, known = posterior.terms(draw.model), len(posterior.channel.nuisances)
     parts = [values for _, values in by_term(terms, draw.values)]
@@ -71,7 +141,7 @@ def _without_curves(posterior: Posterior, draw: Draw, parts: Sequence[Array], re
             kept |= {t: np.zeros(1) for t, c in enumerate(candidates) if c.effect == term.effect}
     model = posterior.model(tuple(kept))
     values = np.concatenate([*parts[: len(known)], *(kept[t] for t in model.terms)])
-    return Draw(model, draw.setting, values, rest)
+    return Draw(model, draw.setting, values, rest if draw.unnamed is None else draw.unnamed + rest)
 
 
 def _of_speed(term: Term) -> bool:

@@ -70,6 +70,7 @@ class InverseForm:
     # tries other numbers.
     swings: bool = False
     of_speed: bool = False  # friction as a function of speed, of both directions alike
+    equal: str = ""  # the plainer effect that it is where its coefficients are equal
 
     def grid_for(self, views: Sequence[View]) -> tuple[Shape, ...]:
         """The shapes to try on these recordings."""
@@ -82,6 +83,7 @@ def linear(
     *,
     bounded: int = 1,
     of_speed: bool = False,
+    equal: str = "",
 ) -> InverseForm:
     """The form of an effect whose parameters enter linearly: by name, N m per unit of each along a view, (n,)."""
     return InverseForm(
@@ -91,6 +93,7 @@ def linear(
         bounds=bounds,
         bounded=bounded,
         of_speed=of_speed,
+        equal=equal,
     )
 
 

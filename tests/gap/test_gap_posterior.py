@@ -28,7 +28,7 @@ from frictid_hil.gap.findings import (
     sampled,
 )
 from frictid_hil.gap.gaussian import integrated, put_inside
-from frictid_hil.gap.plainest import plainest
+from frictid_hil.gap.plainest import _equal, plainest
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.posterior import VISIBLE, Draw, Posterior, by_term
 from frictid_hil.gap.residuals import recordings
@@ -160,6 +160,35 @@ def test_what_curves_leave_of_an_error_is_no_more_than_is_hidden_or_has_no_name(
     curves = np.linalg.lstsq(columns[:, 1:3], columns[:, 0], rcond=None)[0] * times
     draw = Draw(posterior.model((1, 2, 3)), 0, np.array([-0.85 * times, *curves, unnamed]))
     assert ("stribeck" not in plainest(posterior, draw, gram).model.effects) is told
+
+
+@pytest.mark.parametrize(("backdriving", "told"), [(0.8, "load_dependent_friction"), (0.3, "directional_efficiency")])
+def test_a_gear_that_loses_about_as_much_either_way_has_a_friction_with_the_load(backdriving: float, told: str) -> None:
+    random = np.random.default_rng(6)
+    load, driving = np.abs(random.standard_normal(1600)), np.arange(1600) % 2 == 0
+    columns = np.stack([load * driving, load * ~driving, load, random.standard_normal(1600)], axis=1)
+    log = Rows("log", False, 0.0, random.standard_normal(1600), columns, np.zeros(1600), np.ones(1600, dtype=bool))
+    candidates = (
+        Term("directional_efficiency", {}, (0, 1), np.zeros(2), np.ones(2), 0.0, np.inf, 2),
+        Term("load_dependent_friction", {"quadratic": 0.0}, (2,), np.zeros(1), np.ones(1)),
+        Term("torque_ripple", {"first": 1.0}, (3,), np.zeros(1), np.ones(1)),
+    )
+    posterior = Posterior(Channel("plant", 0.01, (log,), (), candidates, 1.0, 20.0), 20)
+    draw = Draw(posterior.model((0, 2)), 0, np.array([1.0, backdriving, 0.5]))
+    plain = plainest(posterior, draw, columns.T @ columns / columns.shape[0])
+    assert plain.model.effects == {told, "torque_ripple"}
+    made = [np.zeros(1600), np.zeros(1600)]
+    for k, one in enumerate((draw, plain)):
+        for numbers, values in posterior.contributions(one).values():
+            made[k] += columns[:, numbers] @ values
+    np.testing.assert_allclose(made[0], made[1])
+    if told == "load_dependent_friction":
+        assert plain.values == pytest.approx([0.9, 0.5], abs=0.02)
+
+
+def test_of_equal_parts_no_more_is_sure_than_the_form_of_what_is_plainer_tells() -> None:
+    chances = [_equal(off**2) for off in (0.0, 0.1, 0.2, 0.4)]
+    assert chances == pytest.approx([0.85, 0.77, 0.43, 0.002], abs=0.01)
 
 
 def test_a_curve_that_nothing_cancels_keeps_its_name() -> None:

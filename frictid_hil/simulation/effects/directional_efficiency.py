@@ -54,5 +54,6 @@ EFFECT = Effect(
         },
         (0.0, math.inf),  # no gear returns more than it is given
         bounded=2,
+        equal="load_dependent_friction",
     ),
 )
