@@ -1,9 +1,9 @@
 """What one cause alone takes off recordings that did not fit it, both ways round: plain least squares.
 
-The posterior weighs every band and every form, and calls a joint ``unknown`` whose gap it cannot put together. That a
-single cause is half of that gap may be plain all the same: fitted on the identification logs it takes it off the
-validation logs, and fitted on those it takes it off the others. What only looks like a cause hardly passes both, or
-takes off less than functions without a name do.
+The posterior weighs every band and every form, and calls a joint ``unknown`` whose gap it cannot put together. A single
+cause may plainly be half of that gap all the same, of what tolerances leave of it. It is fitted on the identification
+logs and judged on the validation logs, then the other way round. What only looks like a cause hardly passes both, or
+takes off clearly less than functions without a name do.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.channel import Channel, Rows, Term
+from frictid_hil.gap.channel import STIFFNESS, Channel, Rows, Term
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Finding, read_numbers
 from frictid_hil.gap.how_far import Closed, closed_with
@@ -26,7 +26,7 @@ FAIR_SHARE = 1.0 - math.sqrt(0.5)
 TIE = 0.9  # share over that of the best, functions without a name among them, from which on the two are told alike
 LIKELY = 0.25  # chance below which a cause is no cause, whatever it takes off
 ROUNDS = 4  # of fitting the noise that weighs tolerances against recordings
-DRAWS = 200  # of coefficients, from which intervals are read: an end is known to a tenth of a one-sigma
+DRAWS = 400  # of coefficients, from which intervals are read: an end is known to a seventh of a one-sigma
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +68,8 @@ def _half(cause: Finding, fit: Fit, posterior: Posterior) -> Half:
     drawn = fit.mean + random.standard_normal((DRAWS, fit.mean.size)) @ fit.root.T
     forms = 1.0 + form_of(cause.effect) * random.standard_normal(DRAWS)
     own = len(fit.term.columns)
+    bounded = slice(-own, fit.mean.size - own + fit.term.bounded)
+    drawn[:, bounded] = np.clip(drawn[:, bounded], fit.term.least, fit.term.largest)
     told = [read_numbers(cause.effect, posterior.channel, fit.term, values[-own:]) for values in (fit.mean, *drawn)]
     numbers = {}
     for name, value in told[0].items():
@@ -82,7 +84,8 @@ def both_ways(channel: Channel) -> dict[str, Fit]:
     """By cause or family of functions: its fit to the identification logs, ``taken`` the smaller share of both ways.
 
     Beside it stands, with and without it, what tolerances of the belief allow, but not the one that it is an error of.
-    Empty where one role has no logs.
+    A cause whose coefficients lie beyond their bounds is another effect, and takes nothing. Empty where one role has no
+    logs.
     """
     roles = [[log for log in channel.logs if log.validation is role] for role in (False, True)]
     if not all(roles):
@@ -94,18 +97,24 @@ def both_ways(channel: Channel) -> dict[str, Fit]:
 
 
 def _one_way(channel: Channel, fitted: tuple[Array, int], judged: tuple[Array, int], stretch: float) -> dict[str, Fit]:
-    """The same one way: of all shapes that fit which leaves least of the fitted logs."""
+    """The same one way, each with the shape that the fitted logs are best told by."""
     nothing = Term("", {}, (), np.zeros(0), np.zeros(0))
     before: dict[str, float] = {}
-    best: dict[str, Fit] = {}
-    for term in channel.candidates:
+    best: dict[str, tuple[float, Fit]] = {}
+    told = fitted[1] / stretch  # rows that tell something by themselves
+    for term in (t for t in channel.candidates if STIFFNESS not in t.shape):
         beside = [n for n in channel.nuisances if n.effect != term.effect or n.shape]
         if term.effect not in before:
             before[term.effect] = _fit(fitted, judged, beside, nothing, stretch).left_over
         fit = _fit(fitted, judged, beside, term, stretch)
-        if term.effect not in best or fit.left < best[term.effect].left:
-            best[term.effect] = replace(fit, taken=1.0 - fit.left_over / before[term.effect])
-    return best
+        # A shape of more columns has to be worth them.
+        score = 2.0 * told * math.log(fit.left) + len(term.columns) * math.log(max(told, 1.0))
+        own = fit.mean[fit.mean.size - len(term.columns) :][: term.bounded]
+        possible = bool(np.all((own >= term.least) & (own <= term.largest)))
+        taken = 1.0 - fit.left_over / before[term.effect] if possible else 0.0
+        if term.effect not in best or score < best[term.effect][0]:
+            best[term.effect] = score, replace(fit, taken=taken)
+    return {effect: fit for effect, (_, fit) in best.items()}
 
 
 def _products(logs: Sequence[Rows], level_free: bool) -> tuple[Array, int]:

@@ -15,7 +15,7 @@ from frictid_hil.gap.both_ways import half_of_it
 from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, below_first_pair
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
-from frictid_hil.gap.findings import Finding, numbers, told_numbers
+from frictid_hil.gap.findings import EVEN, Finding, numbers, told_numbers
 from frictid_hil.gap.forward import Simulation, pooled
 from frictid_hil.gap.how_far import Closed
 from frictid_hil.gap.prepared import Prepared, prepared
@@ -46,7 +46,7 @@ from frictid_hil.gap.verdict import (
 )
 from frictid_hil.simulation.effects import all_effects
 
-HALF_OF_IT = "one cause alone takes half of the power of the gap off recordings that did not fit it, both ways round"
+HALF_OF_IT = "the cause alone takes half of the power of what tolerances leave off recordings that did not fit it"
 UNDECIDED = 0.5  # most that is claimed of causes that a motion or the lack of a second log cannot tell apart
 
 
@@ -140,7 +140,7 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
             gaps = gaps_left(channels, said.named)
     if half := _half_of_it(joint, reading, said, gaps):
         said, gaps = half
-        reasons["rest"] = f"{HALF_OF_IT}; the rest lives in: {said.place}"
+        reasons["rest"] = f"{HALF_OF_IT}; the rest has no name"
         reasons.pop("closed_loop", None)  # that was of causes which are named no more
     said = _cautious(said, reasons, any(r.experiment.validation for r in joint.logs))
     gaps = gaps if reading.along is None else [*gaps, *gaps_left([reading.along], said.named)]
@@ -153,13 +153,15 @@ def _half_of_it(
     """What one cause is plainly half of, although the rest has no name; it has to close the loop by half, as any."""
     if said.word != "unknown" or reading.sought or not reading.channels:
         return None
+    if said.place.startswith("actuation") or any(stays(gap, HALF) for gap in gaps[1:]):
+        return None  # what shows in the drive is no cause of the joint's
     halves = half_of_it(reading.found, reading.channels[0].posterior)
     if joint.simulation is not None:
         before_nm, noise_nm = pooled(joint.simulation.bare, "torque_nm"), _noise_nm(joint.simulation, gaps)
         most = HALF**2 * (before_nm**2 - noise_nm**2)
         left = [joint.simulation.gap_nm(told_numbers([half.cause])) for half in halves]
         halves = [half for half, nm in zip(halves, left, strict=True) if nm**2 - noise_nm**2 <= most]
-    if not halves:
+    if not halves or (len(halves) == 1 and halves[0].cause.confidence < EVEN):
         return None
     first, causes = halves[0], [half.cause for half in halves]
     if len(causes) == 1:

@@ -79,7 +79,7 @@ def sampled(posterior: Posterior) -> Sampled:
     levels = float(posterior.channel.level_free)
     x = np.concatenate([log.x[log.told] - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
-    chances = np.random.default_rng(0).permutation((np.arange(DRAWS) + 0.5) / DRAWS)
+    chances = np.random.default_rng(1).permutation((np.arange(DRAWS) + 0.5) / DRAWS)  # others than of ``_lent``
     drawn = posterior.draws(posterior.search(), DRAWS)
     draws = [plainest(posterior, draw, gram, chance) for draw, chance in zip(drawn, chances, strict=True)]
     held = [_by_cause(posterior, draw) for draw in draws]

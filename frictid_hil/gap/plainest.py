@@ -15,20 +15,20 @@ from frictid_hil.simulation.effects import all_effects
 SPEED = FAMILY + "velocity"  # functions of speed without a name
 CANCELS = 0.25
 """Power of what causes make together over that of the largest, below which they mostly cancel: half of its size."""
-ONE_PART = math.sqrt(0.5)  # share that is left of an effect of one part of two alike by what has equal parts
+ONE_PART = math.sqrt(0.5)  # RMS that equal parts leave, over the whole, if only one of two parts is there
 CLEAR = 1.96  # one-sigmas of a belief from which on its error is a cause of its own: 95 %
 
 
-def plainest(posterior: Posterior, draw: Draw, gram: Array, surer: float = 0.5) -> Draw:
+def plainest(posterior: Posterior, draw: Draw, gram: Array, threshold: float = 0.5) -> Draw:
     """The draw with its causes told in the plainest way that their forms allow.
 
-    ``gram`` holds mean products of the channel's columns, shape (m, m). A chance is taken where it is ``surer`` than
-    this: over many draws, where each has another one, it is taken as often as it is worth.
+    ``gram`` holds mean products of the channel's columns, shape (m, m). A plainer effect is told if its chance is above
+    ``threshold``; draws with thresholds from 0 to 1 tell it as often as it is likely.
     """
-    return _plain_curves(posterior, _plain_parts(posterior, draw, gram, surer), gram)
+    return _plain_curves(posterior, _plain_parts(posterior, draw, gram, threshold), gram)
 
 
-def _plain_parts(posterior: Posterior, draw: Draw, gram: Array, surer: float) -> Draw:
+def _plain_parts(posterior: Posterior, draw: Draw, gram: Array, threshold: float) -> Draw:
     """The draw with the plainer effect in the place of one whose parts may as well be equal.
 
     If they are equal, what the two effects make together is off the plainer one by the one-sigma of its form; if not,
@@ -38,7 +38,7 @@ def _plain_parts(posterior: Posterior, draw: Draw, gram: Array, surer: float) ->
     for effect in sorted(draw.model.effects):
         known = all_effects().get(effect)
         plain = known.inverse.equal if known is not None and known.inverse is not None else ""
-        shapes = [t for t, one in enumerate(candidates) if plain and one.effect == plain]
+        shapes = [t for t, one in enumerate(candidates) if plain and one.effect == plain and len(one.columns) == 1]
         parts = posterior.contributions(draw)
         made = np.zeros(gram.shape[0])
         for name in (effect, plain):
@@ -47,7 +47,8 @@ def _plain_parts(posterior: Posterior, draw: Draw, gram: Array, surer: float) ->
         fits = [(t, *_nearest(made, candidates[t], gram)) for t in shapes]
         left = {t: float(rest @ gram @ rest) for t, values, rest in fits if _allowed(candidates[t], values)}
         best = min(left, key=lambda t: left[t], default=None)
-        if best is not None and _equal(left[best] / float(made @ gram @ made)) > surer:
+        whole = float(made @ gram @ made)
+        if best is not None and whole > 0.0 and _equal(left[best] / whole) > threshold:
             _, values, rest = fits[shapes.index(best)]
             kept = {t: part for t, part in _own(posterior, draw) if candidates[t].effect not in (effect, plain)}
             draw = _with_terms(posterior, draw, {**kept, best: values}, rest)
@@ -55,7 +56,7 @@ def _plain_parts(posterior: Posterior, draw: Draw, gram: Array, surer: float) ->
 
 
 def _equal(off: float) -> float:
-    """Chance that parts are equal by the square of what that leaves, over that of what there is."""
+    """Chance that the parts are equal; ``off`` is the mean square that equal parts leave, over that of the effects."""
     odds = math.exp(-0.5 * off / FORM**2) * ONE_PART * math.sqrt(2.0 / math.pi) / FORM
     return odds / (1.0 + odds)
 

@@ -86,8 +86,28 @@ def test_a_tolerance_hides_another_cause_and_not_the_error_that_it_is_of() -> No
 
 def test_a_cause_far_beyond_its_prior_is_not_taken_for_what_it_may_not_be() -> None:
     """The residual is slow, so that its rows tell little: a tolerance is worth more than a few of them."""
-    narrow = replace(channel(both(1.5, 0.0, 1.0)), candidates=(term(LOAD, 0, 1e-3),))
-    assert taken_both_ways(narrow)[LOAD] < 0.05
+    narrow = replace(channel(both(1.5, 0.0, 1.0)), candidates=(term(LOAD, 0, 0.05),))
+    assert taken_both_ways(narrow)[LOAD] < 0.15
+
+
+def test_a_cause_beyond_its_bounds_is_another_one() -> None:
+    made = channel(both(-1.5, 0.0, 1.0))
+    losses = replace(made, candidates=(replace(made.candidates[0], least=0.0, largest=np.inf), *made.candidates[1:]))
+    assert taken_both_ways(made)[LOAD] > 0.4 and taken_both_ways(losses)[LOAD] == 0.0
+
+
+def test_a_shape_of_more_columns_has_to_be_worth_them() -> None:
+    one = channel(both(1.5, 0.0, 1.0))
+    richer = replace(
+        one.candidates[0], shape={"quadratic": 1.0}, columns=(0, 1), mean=np.zeros(2), deviation=np.ones(2)
+    )
+    assert both_ways(replace(one, candidates=(richer, *one.candidates)))[LOAD].term is one.candidates[0]
+
+
+def test_the_error_of_a_stated_stiffness_is_no_effect_of_its_own() -> None:
+    one = channel(both(1.5, 0.0, 1.0))
+    stiffness = replace(one.candidates[0], effect="presliding_hysteresis", shape={"stiffness": 1.0})
+    assert "presliding_hysteresis" not in both_ways(replace(one, candidates=(stiffness, *one.candidates)))
 
 
 def test_recordings_of_one_role_say_nothing_both_ways() -> None:
@@ -167,6 +187,18 @@ def test_two_that_tie_are_ambiguous_and_each_says_so_of_the_other() -> None:
     assert said is not None and said[0].word == "ambiguous"
     assert [(f.effect, f.rivals) for f in said[0].named] == [(LOAD, (RIPPLE,)), (RIPPLE, (LOAD,))]
     assert {f.confidence for f in said[0].named} == {TIED}
+
+
+def test_a_doubtful_cause_is_not_told_for_being_half_of_the_gap() -> None:
+    made = channel(both(1.5, 0.0, 1.0))
+    assert _half_of_it(joint(None), reading([finding(LOAD, 0.4)], made), NONE_SAID, []) is None
+
+
+def test_what_shows_in_the_drive_is_no_cause_of_the_joint() -> None:
+    made = reading([finding(LOAD)], channel(both(1.5, 0.0, 1.0)))
+    plant, drive = Closed("plant", 3.0, 3.0, 2.0, 4.0, 1.0), Closed("actuation", 9.0, 9.0, 8.0, 10.0, 1.0)
+    assert _half_of_it(joint(None), made, NONE_SAID, [plant, drive]) is None
+    assert _half_of_it(joint(None), made, Verdict("unknown", (), "actuation: time"), [plant]) is None
 
 
 def test_what_is_explained_already_stays() -> None:

@@ -186,6 +186,20 @@ def test_a_gear_that_loses_about_as_much_either_way_has_a_friction_with_the_load
         assert plain.values == pytest.approx([0.9, 0.5], abs=0.02)
 
 
+def test_a_gear_that_carries_no_load_has_no_parts_to_compare() -> None:
+    columns = np.zeros((400, 3))
+    log = Rows(
+        "log", False, 0.0, np.random.default_rng(6).standard_normal(400), columns, np.zeros(400), np.ones(400, bool)
+    )
+    candidates = (
+        Term("directional_efficiency", {}, (0, 1), np.zeros(2), np.ones(2), 0.0, np.inf, 2),
+        Term("load_dependent_friction", {"quadratic": 0.0}, (2,), np.zeros(1), np.ones(1)),
+    )
+    posterior = Posterior(Channel("plant", 0.01, (log,), (), candidates, 1.0, 20.0), 20)
+    draw = Draw(posterior.model((0,)), 0, np.array([1.0, 1.0]))
+    assert plainest(posterior, draw, np.zeros((3, 3))) is draw
+
+
 def test_of_equal_parts_no_more_is_sure_than_the_form_of_what_is_plainer_tells() -> None:
     chances = [_equal(off**2) for off in (0.0, 0.1, 0.2, 0.4)]
     assert chances == pytest.approx([0.85, 0.77, 0.43, 0.002], abs=0.01)
