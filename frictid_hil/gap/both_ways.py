@@ -25,6 +25,7 @@ FAIR_SHARE = 1.0 - math.sqrt(0.5)
 """Share of a gap's RMS that a cause takes off, from which on it is half of its power: more than all else together."""
 TIE = 0.9  # share over that of the best, functions without a name among them, from which on the two are told alike
 LIKELY = 0.25  # chance below which a cause is no cause, whatever it takes off
+EXACT = 1e-12  # mean square over that of the residual, below which logs are told exactly
 ROUNDS = 4  # of fitting the noise that weighs tolerances against recordings
 DRAWS = 400  # of coefficients, from which intervals are read: an end is known to a seventh of a one-sigma
 
@@ -91,6 +92,8 @@ def both_ways(channel: Channel) -> dict[str, Fit]:
     if not all(roles):
         return {}
     one, other = (_products(logs, channel.level_free) for logs in roles)
+    if min(_square(one), _square(other)) == 0.0:
+        return {}  # there is nothing to take off
     stretch = max(1.0, MEMORY_S[-1] / channel.step_s)  # rows that tell as much as one: what is left is slow
     ways = [_one_way(channel, fitted, judged, stretch) for fitted, judged in ((one, other), (other, one))]
     return {effect: replace(fit, taken=min(way[effect].taken for way in ways)) for effect, fit in ways[0].items()}
@@ -109,8 +112,7 @@ def _one_way(channel: Channel, fitted: tuple[Array, int], judged: tuple[Array, i
         fit = _fit(fitted, judged, beside, term, stretch)
         # A shape of more columns has to be worth them.
         score = 2.0 * told * math.log(fit.left) + len(term.columns) * math.log(max(told, 1.0))
-        own = fit.mean[fit.mean.size - len(term.columns) :][: term.bounded]
-        possible = bool(np.all((own >= term.least) & (own <= term.largest)))
+        possible = term.allows(fit.mean[fit.mean.size - len(term.columns) :])
         taken = 1.0 - fit.left_over / before[term.effect] if possible else 0.0
         if term.effect not in best or score < best[term.effect][0]:
             best[term.effect] = score, replace(fit, taken=taken)
@@ -133,22 +135,25 @@ def _fit(
     at = np.concatenate([np.array(t.columns, dtype=int) for t in terms])
     deviation = np.maximum(np.concatenate([t.deviation for t in terms]), 1e-300)
     expected = np.concatenate([t.mean for t in terms]) / deviation
-    gram, rows = fitted
+    gram, _ = fitted
     inner = gram[np.ix_(at, at)] * deviation[:, None] * deviation
     right = gram[at, -1] * deviation
-    variance, values = gram[-1, -1] / max(rows, 1) + 1e-300, expected
+    least = EXACT * (_square(fitted) + _square(judged))
+    variance, values = _square(fitted) + least, expected
     for _ in range(ROUNDS):
         ridge = stretch * variance
         values = np.linalg.solve(inner + ridge * np.eye(at.size), right + ridge * expected)
-        variance = _mean_square(fitted, at, deviation * values)
+        variance = _square(fitted, at, deviation * values) + least
     spread = np.linalg.inv(inner / (stretch * variance) + np.eye(at.size))
     root = deviation[:, None] * np.linalg.cholesky(spread + 1e-14 * np.eye(at.size))
-    left_over = math.sqrt(_mean_square(judged, at, deviation * values))
+    left_over = math.sqrt(_square(judged, at, deviation * values) + least)
     return Fit(term, at, deviation * values, root, math.sqrt(variance), left_over)
 
 
-def _mean_square(products: tuple[Array, int], at: np.ndarray, values: Array) -> float:
-    """Of what coefficients leave of the residual; never quite 0."""
+def _square(products: tuple[Array, int], at: np.ndarray | None = None, values: Array | None = None) -> float:
+    """Mean square of the residual, or of what coefficients of some columns leave of it."""
     gram, rows = products
-    left = gram[-1, -1] - 2.0 * values @ gram[at, -1] + values @ gram[np.ix_(at, at)] @ values
-    return max(float(left), 0.0) / max(rows, 1) + 1e-300
+    left = gram[-1, -1]
+    if at is not None and values is not None:
+        left += values @ gram[np.ix_(at, at)] @ values - 2.0 * values @ gram[at, -1]
+    return max(float(left), 0.0) / max(rows, 1)

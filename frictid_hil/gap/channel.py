@@ -36,6 +36,11 @@ class Term:
     largest: float = math.inf  # of the same
     bounded: int = 1  # how many of its coefficients, from the first on, are bounded
 
+    def allows(self, values: Array) -> bool:
+        """Whether coefficients, shape (k,), lie within their bounds."""
+        own = values[: self.bounded]
+        return bool(np.all((own >= self.least) & (own <= self.largest)))
+
 
 @dataclass(frozen=True, slots=True)
 class Rows:

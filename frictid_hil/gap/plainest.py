@@ -44,14 +44,14 @@ def _plain_parts(posterior: Posterior, draw: Draw, gram: Array, threshold: float
         for name in (effect, plain):
             if name in parts:
                 np.add.at(made, *parts[name])
-        fits = [(t, *_nearest(made, candidates[t], gram)) for t in shapes]
-        left = {t: float(rest @ gram @ rest) for t, values, rest in fits if _allowed(candidates[t], values)}
-        best = min(left, key=lambda t: left[t], default=None)
         whole = float(made @ gram @ made)
-        if best is not None and whole > 0.0 and _equal(left[best] / whole) > threshold:
-            _, values, rest = fits[shapes.index(best)]
-            kept = {t: part for t, part in _own(posterior, draw) if candidates[t].effect not in (effect, plain)}
-            draw = _with_terms(posterior, draw, {**kept, best: values}, rest)
+        for t in shapes if whole > 0.0 else ():
+            values, rest = _nearest(made, np.array(candidates[t].columns), gram)
+            if candidates[t].allows(values) and _equal(float(rest @ gram @ rest) / whole) > threshold:
+                known_parts, own = _split(posterior, draw)
+                kept = {k: part for k, part in own.items() if candidates[k].effect not in (effect, plain)}
+                draw = _with_terms(posterior, draw, known_parts, {**kept, t: values}, rest)
+                break
     return draw
 
 
@@ -61,30 +61,27 @@ def _equal(off: float) -> float:
     return odds / (1.0 + odds)
 
 
-def _nearest(made: Array, term: Term, gram: Array) -> tuple[Array, Array]:
-    """(Coefficients of a term that come nearest to what coefficients of all columns make, what they leave of those)."""
-    at = np.array(term.columns)
+def _nearest(made: Array, at: np.ndarray, gram: Array) -> tuple[Array, Array]:
+    """(Coefficients of some columns that come nearest to what those of all make, what they leave of those)."""
     values = np.linalg.lstsq(gram[np.ix_(at, at)], gram[at] @ made, rcond=None)[0]
     rest = made.copy()
     rest[at] -= values
     return values, rest
 
 
-def _allowed(term: Term, values: Array) -> bool:
-    return bool(np.all((values[: term.bounded] >= term.least) & (values[: term.bounded] <= term.largest)))
-
-
-def _own(posterior: Posterior, draw: Draw) -> list[tuple[int, Array]]:
-    """The draw's candidates with their coefficients."""
+def _split(posterior: Posterior, draw: Draw) -> tuple[list[Array], dict[int, Array]]:
+    """(Coefficients of the nuisances, those of the candidates by number) of a draw."""
     parts = [values for _, values in by_term(posterior.terms(draw.model), draw.values)]
-    return list(zip(draw.model.terms, parts[len(posterior.channel.nuisances) :], strict=True))
+    known = len(posterior.channel.nuisances)
+    return parts[:known], dict(zip(draw.model.terms, parts[known:], strict=True))
 
 
-def _with_terms(posterior: Posterior, draw: Draw, kept: Mapping[int, Array], rest: Array) -> Draw:
-    """The draw with other candidates, and what they leave beside what has no name already."""
-    held = sum(len(term.columns) for term in posterior.channel.nuisances)
+def _with_terms(
+    posterior: Posterior, draw: Draw, known: Sequence[Array], kept: Mapping[int, Array], rest: Array
+) -> Draw:
+    """The draw with other coefficients, and what they leave beside what has no name already."""
     model = posterior.model(tuple(kept))
-    values = np.concatenate([draw.values[:held], *(kept[t] for t in model.terms)])
+    values = np.concatenate([*known, *(kept[t] for t in model.terms)])
     return Draw(model, draw.setting, values, rest if draw.unnamed is None else draw.unnamed + rest)
 
 
@@ -113,12 +110,10 @@ def _plain_curves(posterior: Posterior, draw: Draw, gram: Array) -> Draw:
     untold = min(untold, max((VISIBLE * posterior.floor) ** 2, _unnamed(terms, parts, gram)))
     for chosen in (*([k] for k in plain), plain):
         at = np.array([terms[k].columns[0] for k in chosen])
-        weights = np.linalg.lstsq(gram[np.ix_(at, at)], gram[at] @ together, rcond=None)[0]
-        rest = together.copy()
-        rest[at] -= weights
+        weights, rest = _nearest(together, at, gram)
         if float(rest @ gram @ rest) <= untold:
             told = dict(zip(chosen, weights, strict=True))
-            values = [np.array([told.get(k, 0.0)]) if k in plain else part for k, part in enumerate(parts)]
+            values = [np.array([told.get(k, 0.0)]) if k in plain else part for k, part in enumerate(parts[:known])]
             return _without_curves(posterior, draw, values, rest)
     return draw
 
@@ -132,17 +127,14 @@ def _unnamed(terms: Sequence[Term], parts: Sequence[Array], gram: Array) -> floa
     return float(made @ gram @ made)
 
 
-def _without_curves(posterior: Posterior, draw: Draw, parts: Sequence[Array], rest: Array) -> Draw:
+def _without_curves(posterior: Posterior, draw: Draw, known: Sequence[Array], rest: Array) -> Draw:
     """The draw less its curves, an error that is beyond its tolerance among its causes."""
-    candidates, known = posterior.channel.candidates, posterior.channel.nuisances
-    own = zip(draw.model.terms, parts[len(known) :], strict=True)
-    kept = {t: part for t, part in own if not _of_speed(candidates[t])}
-    for term, part in zip(known, parts, strict=False):
+    candidates = posterior.channel.candidates
+    kept = {t: part for t, part in _split(posterior, draw)[1].items() if not _of_speed(candidates[t])}
+    for term, part in zip(posterior.channel.nuisances, known, strict=True):
         if _of_speed(term) and abs(float(part[0])) > CLEAR * float(term.deviation[0]):
             kept |= {t: np.zeros(1) for t, c in enumerate(candidates) if c.effect == term.effect}
-    model = posterior.model(tuple(kept))
-    values = np.concatenate([*parts[: len(known)], *(kept[t] for t in model.terms)])
-    return Draw(model, draw.setting, values, rest if draw.unnamed is None else draw.unnamed + rest)
+    return _with_terms(posterior, draw, known, kept, rest)
 
 
 def _of_speed(term: Term) -> bool:

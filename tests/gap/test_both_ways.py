@@ -110,6 +110,14 @@ def test_the_error_of_a_stated_stiffness_is_no_effect_of_its_own() -> None:
     assert "presliding_hysteresis" not in both_ways(replace(one, candidates=(stiffness, *one.candidates)))
 
 
+def test_logs_without_noise_and_columns_that_are_one_and_the_same_are_no_obstacle() -> None:
+    one = replace(channel(both(1.5, 0.0, 0.0)), nuisances=(term(LEVEL, 2, 1.0),))
+    exact = replace(one, logs=tuple(replace(log, y=1.5 * log.x[:, 0], x=log.x[:, [0, 0, 2]]) for log in one.logs))
+    assert taken_both_ways(exact)[LOAD] == pytest.approx(1.0, abs=1e-3)
+    silent = replace(exact, logs=(exact.logs[0], replace(exact.logs[1], y=np.zeros(ROWS))))
+    assert taken_both_ways(silent) == {}
+
+
 def test_recordings_of_one_role_say_nothing_both_ways() -> None:
     one = channel(both(1.3, 0.0, 1.0))
     alone = replace(one, logs=one.logs[:1])
