@@ -8,12 +8,9 @@ joint's own causes may be. One posterior weighs the causes of the arm against ea
 
 from __future__ import annotations
 
-import copy
 import functools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +18,10 @@ from scipy import linalg, signal, special
 
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.robot_model import RobotModel, inverse_torque
+from frictid_hil.simulation.body_columns import BodyColumns
+from frictid_hil.simulation.robot_model import RobotModel
 
 Rows = list[list[NDArray[np.intp]]]  # rows that count, by recording and joint
-Motion = tuple[Array, Array, Array]  # position, velocity and acceleration, (n, k) each
 
 CUTOFF_HZ = 15.0
 RATE_HZ = 60.0  # rate to which everything is thinned behind the low-pass
@@ -37,8 +34,6 @@ REGRASPED = 2  # times that a payload's centre is found anew from where it was f
 LIGHTEST = 0.005  # mass of a payload, over that of all links, from which its centre is looked for
 SURE = 0.9  # chance from which a cause of the arm is named
 LEAST_GAIN = 0.02  # fall of the pooled RMS on logs that were not fitted, below which a cause has no practical meaning
-_ROTOR_KG_M2 = 100.0
-UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # no turn, as a quaternion
 NEGLIGIBLE = 1e-6  # share of the largest pivot below which a combination of parameters is not seen at all
 
 
@@ -97,105 +92,6 @@ class _Table:
     moving: NDArray[np.bool_]
 
 
-class _Bodies:
-    """Columns of the arm, made by the user's engine; the joints in the order of the recordings, the others held."""
-
-    def __init__(self, robot: RobotModel, joints: Sequence[str], held: Mapping[str, float]) -> None:
-        self._robot = robot
-        self._numbers = [robot.number(name) for name in joints]
-        self._posture = robot.posture(held)
-        self._model: Any = robot.without_friction()
-        m = self._model
-        self._empty: Any = copy.copy(m)
-        self._empty.body_mass[:] = 0.0
-        self._empty.body_inertia[:] = 0.0
-        # A rotor so heavy that MuJoCo can factor the inertia matrix of any body; what it asks is taken off again.
-        self._empty.dof_armature[:] = _ROTOR_KG_M2
-        self._empty.jnt_stiffness[:] = 0.0
-        self._empty.body_sameframe[:] = 0
-        self._empty.body_simple[:] = 0
-        carried = {int(m.jnt_bodyid[number]) for number in self._numbers}
-        self.bodies = [b for b in range(1, m.nbody) if m.body_mass[b] > 0.0 and self._moves(b, carried)]
-        self.last = max(carried)
-        # Where a payload's centre may lie, in the last body's frame: its own inertia goes by the square of that.
-        self.grasp: Array = np.zeros(3)
-
-    def _moves(self, body: int, carried: set[int]) -> bool:
-        while body > 0:
-            if body in carried:
-                return True
-            body = int(self._model.body_parentid[body])
-        return False
-
-    def name(self, body: int) -> str:
-        """Of a body."""
-        return self._model.body(body).name or f"body {body}"
-
-    @property
-    def mass_kg(self) -> float:
-        """Of all that moves."""
-        return float(sum(self._model.body_mass[b] for b in self.bodies))
-
-    def whole(self, t: Motion) -> Array:
-        """Torque of all bodies."""
-        return inverse_torque(self._model, self._posture, self._numbers, *t)
-
-    def of(self, body: int, t: Motion, mass: float, centre: Array, inertia: Array, quat: Array) -> Array:
-        """Torque of one body of this mass, centre and principal inertia alone."""
-        m = copy.copy(self._empty)
-        m.body_mass[body], m.body_ipos[body], m.body_inertia[body], m.body_iquat[body] = mass, centre, inertia, quat
-        return inverse_torque(m, self._posture, self._numbers, *t) - _ROTOR_KG_M2 * t[2]
-
-    def scaled(self, body: int, t: Motion) -> list[Array]:
-        """Torque of a body as the file has it: what a share of its mass and inertia adds."""
-        m = self._model
-        return [self.of(body, t, m.body_mass[body], m.body_ipos[body], m.body_inertia[body], m.body_iquat[body])]
-
-    def payload(self, t: Motion) -> list[Array]:
-        """Mass at the grasp, and three first moments about it, per kg and kg m."""
-        return self._point(self.last, t, self.grasp)
-
-    def _point(self, body: int, t: Motion, at: Array) -> list[Array]:
-        """The same of a body, at a place in its frame."""
-        columns = [self.of(body, t, 1.0, at, np.zeros(3), UPRIGHT)]
-        for axis in np.eye(3):
-            # Half the difference of opposite places: what is quadratic in the place falls out.
-            there, opposite = (self.of(body, t, 1.0, at + far * axis, np.zeros(3), UPRIGHT) for far in (0.1, -0.1))
-            columns.append((there - opposite) / 0.2)
-        return columns
-
-    def tilt(self, t: Motion) -> list[Array]:
-        """Gravity turned about the two axes across it, per rad."""
-        still = (t[0], np.zeros_like(t[0]), np.zeros_like(t[0]))
-        columns = []
-        for axis in self.tilt_axes:
-            m = copy.copy(self._model)
-            m.jnt_stiffness[:] = 0.0
-            m.opt.gravity[:] = np.cross(axis, self._model.opt.gravity)
-            columns.append(inverse_torque(m, self._posture, self._numbers, *still))
-        return columns
-
-    @property
-    def tilt_axes(self) -> Array:
-        """The two axes of ``tilt``, (2, 3)."""
-        gravity = self._model.opt.gravity
-        axes: Array = linalg.null_space(gravity[None, :] / (np.linalg.norm(gravity) or 1.0)).T
-        return axes
-
-    def regressor(self, t: Motion) -> Array:
-        """Mass, first moments and inertias of every body, (n * k, 10 * bodies)."""
-        columns = []
-        none = np.zeros(3)
-        # Half a right angle about each axis turns (1, -1, 0) into an off-diagonal inertia.
-        c, s = math.cos(math.pi / 8.0), math.sin(math.pi / 8.0)
-        turned = [([1.0, -1.0, 0.0], [c, 0, 0, s]), ([1.0, 0.0, -1.0], [c, 0, s, 0]), ([0.0, 1.0, -1.0], [c, s, 0, 0])]
-        for body in self.bodies:
-            columns += self._point(body, t, none)
-            columns += [self.of(body, t, 0.0, none, axis, UPRIGHT) for axis in np.eye(3)]
-            columns += [self.of(body, t, 0.0, none, np.array(i), np.array(q, dtype=float)) for i, q in turned]
-        return np.stack([column.ravel() for column in columns], axis=1)
-
-
 def find_in_arm(
     robot: RobotModel,  # the user's model
     joints: Sequence[str],  # of the recordings, k of them
@@ -205,7 +101,7 @@ def find_in_arm(
     mass_tolerance: float = 0.03,  # one-sigma of every link's mass within which a difference is no cause
 ) -> ArmFindings:
     """Weigh the causes of the arm; deterministic."""
-    bodies = _Bodies(robot, joints, held)
+    bodies = BodyColumns(robot, joints, held)
     tables = [_table(bodies, curves, r) for r in recordings]
     fitted = [t for t in tables if not t.validation] or tables
     judged = [t for t in tables if t.validation] or tables
@@ -238,7 +134,7 @@ def find_in_arm(
 
 
 def _regression(
-    bodies: _Bodies, fitted: Sequence[_Table], scale: Array, mass_tolerance: float
+    bodies: BodyColumns, fitted: Sequence[_Table], scale: Array, mass_tolerance: float
 ) -> tuple[Array, Array, Array, dict[str, Array]]:
     """(y, what tolerances allow, its one-sigma, columns of each cause of the arm); link masses come last in both."""
     y, nuisance, prior, rows = _stacked(fitted, scale)
@@ -259,7 +155,7 @@ def _regression(
     return y, within, spread, {"payload": payload, "base_orientation_error": tilt, **masses}
 
 
-def _grasp(bodies: _Bodies, columns: Array, y: Array, within: Array, spread: Array) -> bool:
+def _grasp(bodies: BodyColumns, columns: Array, y: Array, within: Array, spread: Array) -> bool:
     """Move the grasp to where a payload's centre would lie; whether there is enough of one to say."""
     table, priors = np.concatenate([within, columns], axis=1), np.concatenate([spread, _payload_prior(bodies)])
     mass, *moments = _posterior(y, table, priors, _noise(y, table))[0][-4:]
@@ -269,7 +165,7 @@ def _grasp(bodies: _Bodies, columns: Array, y: Array, within: Array, spread: Arr
     return True
 
 
-def _payload_prior(bodies: _Bodies) -> Array:
+def _payload_prior(bodies: BodyColumns) -> Array:
     mass = PAYLOAD_PRIOR * bodies.mass_kg
     return np.array([mass, *[REACH_PRIOR_M * mass] * 3])
 
@@ -282,7 +178,7 @@ def _torque_of(make: Callable[..., list[Array]], values: Array) -> Callable[[Arr
     return torque
 
 
-def _candidates(bodies: _Bodies) -> dict[str, tuple[Callable[..., list[Array]], Array]]:
+def _candidates(bodies: BodyColumns) -> dict[str, tuple[Callable[..., list[Array]], Array]]:
     """Columns and priors of every cause, by name."""
     found: dict[str, tuple[Callable[..., list[Array]], Array]] = {
         "payload": (bodies.payload, _payload_prior(bodies)),
@@ -294,7 +190,7 @@ def _candidates(bodies: _Bodies) -> dict[str, tuple[Callable[..., list[Array]], 
     return found
 
 
-def _table(bodies: _Bodies, curves: Sequence[FrictionCurve | None], r: Recorded) -> _Table:
+def _table(bodies: BodyColumns, curves: Sequence[FrictionCurve | None], r: Recorded) -> _Table:
     """A recording behind the low-pass, thinned."""
     step_s = float(np.median(np.diff(r.time_s)))
     rate = 1.0 / step_s
@@ -413,7 +309,7 @@ def _beyond(name: str, found: Array, width: Array, mass_tolerance: float) -> boo
     return bool(np.any(np.abs(found) > width))
 
 
-def _named(bodies: _Bodies, name: str, chance: float, found: Array, width: Array) -> ArmCause:
+def _named(bodies: BodyColumns, name: str, chance: float, found: Array, width: Array) -> ArmCause:
     effect, _, body = name.partition(" ")
     if effect == "link_mass_error":
         return ArmCause(effect, body, chance, {"error_share": _interval(found[0], width[0])})
@@ -432,7 +328,7 @@ def _interval(value: float, half: float) -> tuple[float, float, float]:
     return float(value), float(value - half), float(value + half)
 
 
-def _base_parameters(bodies: _Bodies, tables: Sequence[_Table]) -> BaseParameters:
+def _base_parameters(bodies: BodyColumns, tables: Sequence[_Table]) -> BaseParameters:
     """Rank and condition of the regressor along the fitted motions, by QR with pivots."""
     motion = [np.concatenate([getattr(t, name) for t in tables]) for name in ("position", "velocity", "acceleration")]
     some = slice(None, None, max(1, motion[0].shape[0] // 400))
