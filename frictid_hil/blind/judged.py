@@ -19,6 +19,7 @@ from frictid_hil.blind.score import CONFIDENT, Answer, Rate, counted, not_taken_
 FALSE_CLEAR = 3.0  # gap over floor from which ``none`` is a false all-clear
 BINS = 10  # of confidence, for the calibration error
 LEVEL = "friction_level_error"
+LIKELY = 0.5  # confidence from which a cause is claimed rather than mentioned
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +42,7 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
     # A first cause that is neither there nor not is no mistake.
     sure = [not _there(t, a.first) and a.first not in t["neutral"] for t, a, _ in cases if a.confidence >= CONFIDENT]
     off = [(t, a) for t, a in visible if LEVEL in t["main"]]
+    taken = [a.confidence >= LIKELY and a.first not in (*t["main"], *_tied(t)) for t, a in off]
 
     def first(chosen: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
         return counted(_right(t, a) for t, a in chosen)
@@ -63,8 +65,10 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
             a.verdict == "none" for t, a, _ in cases if t["size_ratio"] >= FALSE_CLEAR
         ),
         "sure_and_wrong": Rate(sum(sure), len(cases)).to_json(),
-        "friction_level_taken_for_another": counted(
-            a.confidence >= 0.5 and a.first not in (*t["main"], *_tied(t)) for t, a in off
+        "friction_level_taken_for_another": counted(taken),
+        # A level that is told behind another cause is told.
+        "friction_level_not_told_at_all": counted(
+            another and dict(a.causes).get(LEVEL, 0.0) < LIKELY for another, (_, a) in zip(taken, off, strict=True)
         ),
         "parameters": counted(held for t, _, d in cases for held in _held(t, d)),
         "brier": float(np.mean([(cause.confidence - cause.there) ** 2 for cause in named])) if named else None,
@@ -84,7 +88,8 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
 def headline(scores: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """The rates that a person asks for first, by name."""
     told = {f"first_controller_{name}": rate for name, rate in scores["first_by_controller"].items()}
-    rest = ("none", "outside", "false_none", "sure_and_wrong", "friction_level_taken_for_another", "parameters")
+    level = ("friction_level_taken_for_another", "friction_level_not_told_at_all")
+    rest = ("none", "outside", "false_none", "sure_and_wrong", *level, "parameters")
     names = ("first", "first_of_all", *told, "first_or_tied", *rest)
     return {name: told.get(name) or scores[name] for name in names}
 

@@ -187,6 +187,20 @@ def test_scores_count_what_they_say() -> None:
     )  # fmt: skip
 
 
+def test_a_level_that_is_told_behind_another_cause_is_taken_for_it_and_told() -> None:
+    level = "friction_level_error"
+    truths = {name: _truth("tolerance", [level]) for name in ("behind", "hardly", "instead", "first")}
+    lines = {
+        "behind": _line("explained", ("inertia_error", 0.9), (level, 0.7)),
+        "hardly": _line("explained", ("inertia_error", 0.9), (level, 0.3)),
+        "instead": _line("explained", ("inertia_error", 0.6)),
+        "first": _line("explained", (level, 0.9)),
+    }
+    scores = judged.judged(truths, lines)
+    taken, not_told = scores["friction_level_taken_for_another"], scores["friction_level_not_told_at_all"]
+    assert (taken["right"], taken["of"], not_told["right"], not_told["of"]) == (3, 4, 2, 4)
+
+
 def test_a_case_without_an_answer_is_an_error_and_wrong() -> None:
     scores = judged.judged({"c": _truth("single", ["stribeck"])}, {})
     assert scores["errors"] and scores["first"]["right"] == 0
