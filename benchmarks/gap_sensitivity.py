@@ -246,16 +246,17 @@ def _named(module: ModuleType, name: str) -> str:
 
 
 @contextmanager
-def changed(module: ModuleType, name: str, factor: float) -> Iterator[None]:
+def changed(module: ModuleType, name: str, factor: float, *, odds: bool | None = None) -> Iterator[None]:
     """A constant times a factor wherever it is used, whole where it is a number of things; of a chance, its odds."""
+    of_a_chance = name in CHANCES and (module, name) != (plant_channel, "UNTOLD") if odds is None else odds
     value = getattr(module, name)
     if isinstance(value, tuple):
         other: Any = tuple(one * factor for one in value)
     else:
         other = type(value)(value * factor)
-    if name in CHANCES and (module, name) != (plant_channel, "UNTOLD"):
-        odds = factor * value / (1.0 - value)
-        other = odds / (1.0 + odds)
+    if of_a_chance:
+        changed_odds = factor * value / (1.0 - value)
+        other = changed_odds / (1.0 + changed_odds)
     users = [m for n, m in sys.modules.items() if n.startswith("frictid_hil.gap.") and m.__dict__.get(name) is value]
     with ExitStack() as held:
         for user in users:
