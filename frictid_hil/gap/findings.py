@@ -205,7 +205,7 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
                 home.posterior.channel.name,
             )
         )
-    return sorted(result, key=lambda f: -f.size)
+    return sorted(result, key=lambda f: (-f.leads, -f.size))
 
 
 def told_numbers(found: Iterable[Finding]) -> dict[str, dict[str, float]]:

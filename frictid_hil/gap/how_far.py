@@ -29,7 +29,7 @@ the slow noise."""
 
 @dataclass(frozen=True, slots=True)
 class Closed:
-    """One channel's gap on the validation logs, in its own unit."""
+    """One channel's gap, on the validation logs but for ``fitted``, in its own unit."""
 
     channel: str  # its name
     before: float  # RMS of the residual
@@ -37,8 +37,14 @@ class Closed:
     low: float  # 95 % interval of ``after``, for another recording of these motions or the causes' true numbers
     high: float
     floor: float  # RMS that noise alone leaves
+    fitted: float = 0.0  # RMS of the residual on the identification logs
     # (log, seconds) where something shows that no identification log holds; None where nothing does.
     appeared: tuple[str, float] | None = None
+
+    @property
+    def anywhere(self) -> float:
+        """RMS of the residual on the logs that were judged or on those that were fitted, whichever is larger."""
+        return max(self.before, self.fitted)
 
 
 def closed(channel: Sampled, names: Collection[str]) -> Closed:
@@ -51,16 +57,18 @@ def closed_with(posterior: Posterior, every: Sequence[Array]) -> Closed:
     judged = posterior.channel.judged
     constant = posterior.channel.level_free
     mean = np.mean(every, axis=0)
+    nothing = np.zeros_like(mean)
     left = _left(judged, mean, constant)
     apart = [_left(judged, theta, constant) - left for theta in every]
     after, half = rms(left), _half_width(left, apart, posterior.channel.step_s)
     return Closed(
         posterior.channel.name,
-        rms(_left(judged, np.zeros_like(mean), constant)),
+        rms(_left(judged, nothing, constant)),
         after,
         math.sqrt(max(0.0, after**2 - half)),
         math.sqrt(after**2 + half),
         min(posterior.floor, COLOUR * posterior.channel.known_floor),
+        rms(_left(posterior.channel.fitted, nothing, constant)),
         _appeared(posterior, mean),
     )
 

@@ -65,7 +65,7 @@ def verdict(
     missed = [f for f in found if needed(f, channels) and unreached(f, channels)]
     shown = _shown(found, channels, gaps, otherwise_quiet)
     named = tuple(f for f in found if f.chance >= LISTED and (f in shown or f in missed))
-    quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
+    quiet = otherwise_quiet and all(gap.anywhere <= max(FLOORS * gap.floor, negligible) for gap in gaps)
     explained = _root_sum([channel.explained for channel in channels])
     # What has no name in a demand that is a guess is the guess: there the closed loop tells what stays.
     guessed = [loop_judges and c.posterior.channel.between_rows for c in channels]
@@ -95,7 +95,7 @@ def verdict(
     # where those functions make more of it.
     untold = _unnamed([c for c, _ in telling if c in loud]) and any(stays(gap, REMAINS) for _, gap in telling)
     unexplained = nothing or generic_wins or untold or any(_open(gap, negligible) for _, gap in telling)
-    small = small and all(gap.before <= HALF * negligible for gap in gaps)
+    small = small and all(gap.anywhere <= HALF * negligible for gap in gaps)
     if unexplained and small and _nothing_beyond_tolerance(channels):
         return Verdict("none", ())
     if unexplained:
