@@ -177,7 +177,7 @@ def _net(inner: Array, forms: Array, beliefs: np.ndarray) -> tuple[Array, Array]
 
 
 def findings(channels: Sequence[Sampled]) -> list[Finding]:
-    """All causes of all channels, the one that is expected to make most first."""
+    """All causes of all channels, the one first that is likeliest to be the largest."""
     names = sorted({name for channel in channels for name in channel.sizes})
     if not names:
         return []

@@ -37,7 +37,7 @@ STRETCHES = 6  # parts of the recordings that are left out one by one, at least
 FORM = 0.1
 """One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
 RIGID = 0.02
-"""The same where the mechanics of a rigid link give the form: links bend, and cables pull, by a few hundredths."""
+"""The same where a rigid link, or a factor of the whole torque, gives the form: links bend by a few hundredths."""
 VISIBLE = 0.5
 """Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
 MOST_DOUBT = 3.0

@@ -112,6 +112,14 @@ def test_a_sure_cause_within_noise_is_told_if_it_takes_half_of_the_gap(after: fl
     assert verdict([sure(0.95)], [drawn], [gap], NEGLIGIBLE, otherwise_quiet=True).word == word
 
 
+@pytest.mark.parametrize(("fitted", "word"), [(1.9, "none"), (3.5, "unknown")])
+def test_a_gap_that_only_the_identification_logs_show_is_not_none(fitted: float, word: str) -> None:
+    """Play of 3.4 floors was none, because the validation logs hardly came to it."""
+    drawn = channel("plant", CAUSE, 0.1, np.ones(DRAWS))
+    gap = Closed("plant", 1.2, 1.2, 1.1, 1.3, floor=1.0, fitted=fitted)
+    assert verdict([], [drawn], [gap], NEGLIGIBLE, otherwise_quiet=True).word == word
+
+
 @pytest.mark.parametrize(("reaches", "word"), [(False, "explained"), (True, "none")])
 def test_a_cause_that_the_validation_logs_never_come_to_is_told_all_the_same(reaches: bool, word: str) -> None:
     """A saturation of 19 floors, which only a fast log came to, was no help on slow ones."""
@@ -131,6 +139,15 @@ def test_an_error_is_listed_where_the_draws_agree_on_its_sign(above: float) -> N
     signs = np.where(np.arange(DRAWS) < above * DRAWS, 1.0, -1.0)
     found = findings([channel("plant", ERROR, 3.0, signs)])
     assert [f.effect for f in found] == ([ERROR] if max(above, 1.0 - above) >= SIDED else [])
+
+
+def test_the_cause_that_is_likelier_to_be_the_largest_comes_first() -> None:
+    """In seven draws of ten the other one is smaller; in the rest it is so large that it makes more on average."""
+    steady = channel("plant", CAUSE, 3.0, np.ones(DRAWS))
+    other = channel("actuation", "torque_delay", 2.5, np.ones(DRAWS))
+    rarely = {"torque_delay": np.where(np.arange(DRAWS) < 0.3 * DRAWS, 9.0, 2.5)}
+    found = findings([steady, replace(other, sizes=rarely)])
+    assert [f.effect for f in found] == [CAUSE, "torque_delay"] and found[1].size > found[0].size
 
 
 def test_what_is_no_error_of_the_belief_has_no_sides() -> None:
