@@ -92,6 +92,7 @@ class Nominal:
     gear_ratio: float | None = None  # motor turns per joint turn
     curve: FrictionCurve | None = None  # friction over speed
     presliding_stiffness_nm_per_rad: float | None = None  # of the friction's spring before it slips
+    presliding_travel_rad: float = 2e-4  # over which that spring bends until it slips, where no stiffness is stated
     # Friction builds up as Dahl's and the LuGre model, and not as a spring that slips.
     yields_gradually: bool | None = None
     payload: Payload | None = None  # what is mounted where an experiment says so

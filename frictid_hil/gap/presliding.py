@@ -28,6 +28,9 @@ FURTHER = (
     "the stated presliding stiffness holds and the level does not: friction builds up over {now:.2g} rad instead of "
     "{was:.2g} rad"
 )
+TRAVEL = "no presliding stiffness is stated: friction builds up over {now:.2g} rad in these recordings"
+TRAVELS = (0.04, 0.2, 1.0, 5.0, 25.0)
+"""Travels that are tried where none is stated, over the usual one: from a ball bearing to a soft harmonic drive."""
 SLOW_RAD_S = (0.01, 0.05)
 """Speeds over which friction may fall when sliding begins: what a Stribeck effect makes is not the form's."""
 BEGINS_RAD_S = 0.02  # speed at which friction counts as that of a joint that begins to slide
@@ -39,14 +42,14 @@ CLEARLY = 0.95  # squares that remain with another form or travel, over those wi
 def as_it_yields(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]:
     """(the set with the form of presliding that fits its recordings better, what to tell of it).
 
-    A stiffness that is not stated has no form, and a form that is stated stays.
+    A form that is stated stays. A stiffness that is not stated has none; its travel is the one that fits best.
     """
     nominal = experiments.nominal
-    if nominal.yields_gradually is not None or nominal.presliding_stiffness_nm_per_rad is None or nominal.curve is None:
-        return experiments, None
     logs = [r for r in recordings(experiments) if r.view is not None]
-    if not logs:
+    if nominal.yields_gradually is not None or nominal.curve is None or not logs:
         return experiments, None
+    if nominal.presliding_stiffness_nm_per_rad is None:
+        return _with_best_travel(experiments, logs)
     told: str | None = GRADUALLY
     form = replace(nominal, yields_gradually=True)
     at_once, level_nm = _fit(logs, nominal)
@@ -54,6 +57,18 @@ def as_it_yields(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]
     if gradually > at_once or (gradually > CLEARLY * at_once and not _nearer_in_the_loop(experiments, form)):
         form, told = _with_own_travel(logs, nominal, at_once, level_nm)
     return replace(experiments, nominal=form), told
+
+
+def _with_best_travel(experiments: ExperimentSet, logs: Sequence[Recording]) -> tuple[ExperimentSet, str | None]:
+    """The set whose friction builds up over the travel that fits its recordings clearly best."""
+    nominal = experiments.nominal
+    forms = [replace(nominal, presliding_travel_rad=f * nominal.presliding_travel_rad) for f in TRAVELS]
+    left = [_fit(logs, form)[0] for form in forms]
+    best = int(np.argmin(left))
+    if left[best] > CLEARLY * left[TRAVELS.index(1.0)]:
+        return experiments, None
+    told = TRAVEL.format(now=forms[best].presliding_travel_rad)
+    return replace(experiments, nominal=forms[best]), told
 
 
 def _nearer_in_the_loop(experiments: ExperimentSet, form: Nominal) -> bool:

@@ -287,9 +287,9 @@ def first_slide(position_rad: Array, travel_rad: float) -> int:
 
 
 def friction_scales(nominal: Nominal) -> tuple[float, float]:
-    """(F_0 in N m, presliding stiffness in N m/rad), with a stiff default where the file does not say."""
+    """(F_0 in N m, presliding stiffness in N m/rad), that of ``presliding_travel_rad`` where the file does not say."""
     coulomb = nominal.curve.coulomb_nm if nominal.curve is not None else 1.0
-    return coulomb, nominal.presliding_stiffness_nm_per_rad or coulomb / 2e-4
+    return coulomb, nominal.presliding_stiffness_nm_per_rad or coulomb / nominal.presliding_travel_rad
 
 
 def presliding_state(nominal: Nominal, position_rad: Array, stiffer: float = 1.0) -> Array:

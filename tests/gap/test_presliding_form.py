@@ -91,9 +91,20 @@ def test_more_friction_on_a_spring_of_the_stated_stiffness_bends_it_further() ->
     assert told is not None and "the level does not" in told
 
 
-def test_a_stiffness_that_nobody_states_has_no_form() -> None:
-    experiments, told = as_it_yields(recorded(replace(BELIEF, presliding_stiffness_nm_per_rad=None), bristle=True))
-    assert not experiments.nominal.yields_gradually and told is None
+def test_a_stiffness_that_nobody_states_has_no_form_and_the_travel_that_fits_best() -> None:
+    unstated = replace(BELIEF, presliding_stiffness_nm_per_rad=None)
+    experiments, told = as_it_yields(recorded(unstated, bristle=True))
+    assert not experiments.nominal.yields_gradually and experiments.nominal.presliding_stiffness_nm_per_rad is None
+    true_rad = LEVEL_NM / STIFFNESS
+    assert true_rad / 2.0 < experiments.nominal.presliding_travel_rad < 2.0 * true_rad
+    assert told is not None and "no presliding stiffness is stated" in told
+
+
+def test_the_usual_travel_stays_where_it_fits() -> None:
+    """The joint's friction builds up over 0.75 mrad; tried are factors of five."""
+    usual = replace(BELIEF, presliding_stiffness_nm_per_rad=None, presliding_travel_rad=LEVEL_NM / STIFFNESS)
+    experiments, told = as_it_yields(recorded(usual, bristle=False))
+    assert experiments.nominal.presliding_travel_rad == usual.presliding_travel_rad and told is None
 
 
 def test_a_bristle_is_no_gap_and_its_falling_level_is_named() -> None:
