@@ -2,9 +2,9 @@
 
     FRICTID_REAL_DATA=... FRICTID_REAL_MORE_DATA=... python benchmarks/gap_both_ways.py [--only WORD ...] [--every K]
 
-Every variant of ``gap_variants`` that adds something is diagnosed once. Where that comes to the rule of one cause that
-is half of the gap, the rule is asked again with each constant changed; of a share or a chance, its odds. Counted are
-answers that name what was added, answers that name something else, and answers that change.
+Every variant of ``gap_variants`` that adds something is diagnosed once, and its rule of one cause that is half of the
+gap is asked again with each constant changed; of a share or a chance, its odds. Counted are what the rule alone names:
+what was added, something else, and answers of it that change.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from gap_sensitivity import changed, put
-from gap_variants import answers
+from gap_variants import answers, wanted
 
 from frictid_hil.gap import both_ways, diagnose
 
@@ -51,12 +51,9 @@ def _names(half: Any) -> tuple[str, ...]:
 
 def main() -> int:
     """Print one row for each constant and factor."""
-    words = sys.argv[1:]
-    every = int(words[words.index("--every") + 1]) if "--every" in words else 1
-    only = [words[k + 1] for k, word in enumerate(words) if word == "--only"]
     asked, rows, count = Asked(), dict[str, list[int]](), 0
     with put(diagnose, "_half_of_it", asked):
-        for a in answers(only, every):
+        for a in answers(*wanted(sys.argv[1:])):
             if a.variant.causes == () or not asked.told:
                 continue
             count += 1
@@ -69,7 +66,7 @@ def main() -> int:
     print("|---|---|---|---|")
     for what, counted in rows.items():
         print(f"| {what} | {' | '.join(map(str, counted))} |")
-    print(f"\n{count} answers came to the rule.")
+    print(f"\n{count} answers.")
     return 0
 
 

@@ -74,7 +74,7 @@ LATE: tuple[tuple[ModuleType, str], ...] = (
 )  # fmt: skip
 """What is said of a posterior."""
 SEARCHED: tuple[tuple[ModuleType, str], ...] = (
-    (posterior, "EXPECTED"), (posterior, "WORTH"), (posterior, "FORM"), (posterior, "RIGID"),
+    (posterior, "EXPECTED"), (posterior, "WORTH"), (posterior, "FORM"), (posterior, "EXACT_FORM"),
     (posterior, "MOST_DOUBT"), (posterior, "VISIBLE"), (posterior, "MOST"), (posterior, "TRIED"), (posterior, "POINTS"),
     (posterior, "STRETCHES"), (plainest, "CANCELS"), (plainest, "CLEAR"),
 )  # fmt: skip

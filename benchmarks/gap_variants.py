@@ -425,13 +425,17 @@ def answers(only: Sequence[str], every: int) -> Iterator[Answered]:
             yield Answered(f"{name}: {title}", variant, known, before, after.diagnosis, size)
 
 
+def wanted(words: Sequence[str]) -> tuple[list[str], int]:
+    """(Words that a variant's name must hold, one set in so many) as the command line asks for."""
+    every = int(words[words.index("--every") + 1]) if "--every" in words else 1
+    return [words[k + 1] for k, word in enumerate(words) if word == "--only"], every
+
+
 def main() -> int:
     """Print what is not as it must be, and the counts."""
     words = sys.argv[1:]
-    every = int(words[words.index("--every") + 1]) if "--every" in words else 1
-    only = [words[k + 1] for k, word in enumerate(words) if word == "--only"]
     found = []
-    for a in answers(only, every):
+    for a in answers(*wanted(words)):
         found.append(a)
         judged = {"FALSE NONE": a.false_clear, "SURE AND WRONG": a.sure_and_wrong, "missed": a.missed}
         marks = [mark for mark, bad in judged.items() if bad]

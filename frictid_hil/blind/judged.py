@@ -67,7 +67,7 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
         "sure_and_wrong": Rate(sum(sure), len(cases)).to_json(),
         "friction_level_taken_for_another": counted(taken),
         # A level that is told behind another cause is told.
-        "friction_level_not_told_at_all": counted(
+        "friction_level_not_told": counted(
             another and dict(a.causes).get(LEVEL, 0.0) < LIKELY for another, (_, a) in zip(taken, off, strict=True)
         ),
         "parameters": counted(held for t, _, d in cases for held in _held(t, d)),
@@ -88,7 +88,7 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
 def headline(scores: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """The rates that a person asks for first, by name."""
     told = {f"first_controller_{name}": rate for name, rate in scores["first_by_controller"].items()}
-    level = ("friction_level_taken_for_another", "friction_level_not_told_at_all")
+    level = ("friction_level_taken_for_another", "friction_level_not_told")
     rest = ("none", "outside", "false_none", "sure_and_wrong", *level, "parameters")
     names = ("first", "first_of_all", *told, "first_or_tied", *rest)
     return {name: told.get(name) or scores[name] for name in names}

@@ -35,7 +35,7 @@ class Friction(Open):
     torque_nm: Numbers | None = None  # friction at these speeds
     coulomb_nm: float | None = None  # level, in place of pairs
     viscous_nm_s_per_rad: float | None = None  # slope over speed, beside ``coulomb_nm``
-    # slope of friction over position where friction passes zero
+    # slope of friction over position where friction passes zero; if not stated, what fits the recordings
     presliding_stiffness_nm_per_rad: Positive | None = None
     # ``at once`` as a spring that slips, ``gradually`` as Dahl's and the LuGre model; read off the recordings unless
     # stated

@@ -36,7 +36,7 @@ REDRAWN = 20  # times that a draw outside of its bounds is drawn anew before it 
 STRETCHES = 6  # parts of the recordings that are left out one by one, at least
 FORM = 0.1
 """One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
-RIGID = 0.02
+EXACT_FORM = 0.02
 """The same where a rigid link, or a factor of the whole torque, gives the form: links bend by a few hundredths."""
 VISIBLE = 0.5
 """Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
@@ -53,7 +53,7 @@ POINTS = 4  # points of the grid, the likeliest, at which all candidates are com
 def form_of(effect: str) -> float:
     """One-sigma of what a cause makes beyond its form, over its size."""
     known = all_effects().get(effect)
-    return RIGID if known is not None and known.rigid else FORM
+    return EXACT_FORM if known is not None and known.exact else FORM
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,8 +303,8 @@ class Posterior:
         rest may lie just where a rival is better.
         """
         candidates = self.channel.candidates
-        rigid = self.model([t for t in model.terms if form_of(candidates[t].effect) < FORM]).score
-        lent = FORM**2 * (model.score - rigid) + RIGID**2 * (rigid - self.model(()).score)
+        exact = self.model([t for t in model.terms if form_of(candidates[t].effect) < FORM]).score
+        lent = FORM**2 * (model.score - exact) + EXACT_FORM**2 * (exact - self.model(()).score)
         return min(MOST_DOUBT, 1.0 + max(0.0, lent))
 
     def _surprise(self, model: Model) -> float:

@@ -197,7 +197,7 @@ def test_a_level_that_is_told_behind_another_cause_is_taken_for_it_and_told() ->
         "first": _line("explained", (level, 0.9)),
     }
     scores = judged.judged(truths, lines)
-    taken, not_told = scores["friction_level_taken_for_another"], scores["friction_level_not_told_at_all"]
+    taken, not_told = scores["friction_level_taken_for_another"], scores["friction_level_not_told"]
     assert (taken["right"], taken["of"], not_told["right"], not_told["of"]) == (3, 4, 2, 4)
 
 

@@ -35,7 +35,7 @@ EFFECT = Effect(
         {"believed": np.cos, "true": lambda position: np.cos(position - p["offset_rad"])},
     ),
     belief="zero_offset_rad",
-    rigid=True,
+    exact=True,
     parted=(
         Parting(
             "gravity_error",

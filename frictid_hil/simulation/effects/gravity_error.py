@@ -34,7 +34,7 @@ EFFECT = Effect(
         {"stated": np.cos, "true": lambda position: (1.0 + p["error_share"]) * np.cos(position)},
     ),
     belief="gravity_torque_nm",
-    rigid=True,
+    exact=True,
     parted=(
         Parting(
             "inertia_error",

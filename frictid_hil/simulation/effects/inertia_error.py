@@ -33,6 +33,6 @@ EFFECT = Effect(
         {"stated": np.positive, "true": lambda acceleration: (1.0 + p["error_share"]) * acceleration},
     ),
     belief="inertia_kg_m2",
-    rigid=True,
+    exact=True,
     inverse=linear({"error_share": lambda v: v.link_inertia_kg_m2 * v.acceleration_rad_s2}, (-1.0, math.inf)),
 )

@@ -41,7 +41,7 @@ EFFECT = Effect(
         "true torque (N m)",
         {"stated": np.positive, "with": lambda reported: (1.0 + p["error_share"]) * reported},
     ),
-    rigid=True,
+    exact=True,
     belief="torque_constant",
     tracking=TrackingForm(links=(Link("gain", scaled, 0.05, 2.0, 0.5, neutral=1.0),), order=60, mimics=("backlash",)),
     inverse=linear({"error_share": lambda v: -v.torque_nm}, (-1.0, math.inf)),
