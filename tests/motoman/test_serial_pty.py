@@ -311,8 +311,9 @@ STREAMED = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", STREAMED)
-def test_faults_on_a_pseudo_terminal(fault: str) -> None:
-    with controller(fault) as port:
+def test_faults_on_a_pseudo_terminal(fault: str, tmp_path: Path) -> None:
+    # A name of our own: the kernel gives the number of a terminal that is gone to the next one, of another test.
+    with controller(fault, link=tmp_path / "port") as port:
         driver, streamed = driver_on(port), Streamed()
         started = time.monotonic()
         error = None
