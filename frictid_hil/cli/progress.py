@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import select
 import sys
 import termios
 from collections.abc import Callable, Iterator
@@ -24,6 +25,9 @@ from frictid_hil.runner.events import Event, JobProgress, JointRun, PhaseStarted
 from frictid_hil.runner.ring import Rows
 from frictid_hil.runner.stop_signals import handling_signals
 from frictid_hil.units import degrees, format_duration
+
+_ANSWERS = {"y": True, "yes": True, "n": False, "no": False, "": False}
+_HEAR_SIGNALS_EVERY_S = 0.2
 
 
 def shown_plan(output: Output, plan: Plan, setup: RobotSetup) -> Result:
@@ -79,9 +83,27 @@ def answer(question: str) -> bool:
         with handling_signals(stop):
             with contextlib.suppress(termios.error, OSError, ValueError):  # no terminal
                 termios.tcflush(sys.stdin, termios.TCIFLUSH)
-            return typer.confirm(question, err=True)
-    except (typer.Abort, KeyboardInterrupt):
+            while (said := _line_typed_after(f"{question} [y/N]: ")) not in _ANSWERS:
+                typer.echo("Please type y or n.", err=True)
+            return _ANSWERS[said]
+    except (EOFError, KeyboardInterrupt):
+        typer.echo(err=True)
         raise Interrupted("interrupted at the question; nothing moves", next_step="start again") from None
+
+
+def _line_typed_after(prompt: str) -> str:
+    """The next line, in lower case (``EOFError``: Ctrl-D).
+
+    A signal that comes just before a blocking read is heard by Python only after it. So nothing is read before a
+    line is there, and signals are heard every so often until then.
+    """
+    typer.echo(prompt, nl=False, err=True)
+    while not select.select([sys.stdin], [], [], _HEAR_SIGNALS_EVERY_S)[0]:
+        pass
+    line = sys.stdin.readline()
+    if not line:
+        raise EOFError
+    return line.strip().lower()
 
 
 class TerminalWatcher:

@@ -100,6 +100,14 @@ def test_a_yes_typed_before_the_question_answers_nothing(asked: Terminal, tmp_pa
     assert "nothing has moved" in asked.said and not (tmp_path / "run").exists()
 
 
+def test_what_is_neither_yes_nor_no_is_asked_again(asked: Terminal, tmp_path: Path) -> None:
+    asked.type("maybe\n")
+    asked.until(lambda: "Please type y or n." in asked.said and asked.said.count(QUESTION) == 2)
+    asked.type("n\n")
+    assert asked.ended() == 2
+    assert "nothing has moved" in asked.said and not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("how", ["Ctrl-D", "Ctrl-C", "SIGTERM"])
 def test_whoever_leaves_the_question_leaves_it_at_once_and_nothing_moves(
     asked: Terminal, tmp_path: Path, how: str
