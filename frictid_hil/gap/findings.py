@@ -312,13 +312,20 @@ def numbers(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
     told: dict[str, list[tuple[float, float]]] = {}
     for lent, values in zip(_lent(effect, channels), _of_draws(effect, channels), strict=True):
         for name, value in values.items():
-            told.setdefault(name, []).append((value, lent * value))
+            told.setdefault(name, []).append((value, _put_off(name, value, lent)))
     result = {}
     for name, pairs in told.items():
         plain, widened = np.array(pairs).T
         low, high = np.quantile(widened, [0.025, 0.975])
         result[name] = Value(float(np.median(plain)), float(low), float(high))
     return result
+
+
+def _put_off(name: str, value: float, lent: float) -> float:
+    """A number as the form may have put it off: by a factor, an angle by as many radians, a line's order not at all."""
+    if name.endswith("cycles_per_motor_revolution"):
+        return value
+    return value + lent - 1.0 if name.endswith("phase_rad") else lent * value
 
 
 def _lent(effect: str, channels: Sequence[Sampled]) -> Array:
@@ -346,7 +353,7 @@ def whole_draws(
     drawn = {effect: _of_draws(effect, channels) for effect in told}
     return tuple(
         {
-            effect: {n: float(lent[effect][k]) * value + moved[effect].get(n, 0.0) for n, value in values.items()}
+            effect: {n: _put_off(n, v, float(lent[effect][k])) + moved[effect].get(n, 0.0) for n, v in values.items()}
             for effect in told
             if (values := drawn[effect][k])
         }

@@ -43,7 +43,9 @@ def test_cogging_comes_before_an_offset_that_may_be_friction() -> None:
     found = diagnose(made(0.03))
     assert found.causes[0].effect == "torque_ripple" and found.causes[0].confidence >= DOUBTED
     told = found.causes[0].parameters
-    assert told["cycles_per_motor_revolution"].value == 24.0
+    order, phase = told["cycles_per_motor_revolution"], told["phase_rad"]
+    assert order.low == order.value == order.high == 24.0, "a line is that line, however large it is"
+    assert 0.0 < phase.high - phase.low < 1.0
     assert told["amplitude_nm"].value == pytest.approx(0.03, rel=0.1)
     # Offset and friction stand for one another on such a motion: neither is sure, and nothing is applied.
     others = [c for c in found.causes if c.effect in ("torque_bias", "friction_level_error", "viscous_error")]
