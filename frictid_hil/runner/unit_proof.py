@@ -32,19 +32,27 @@ _SLACK_RAD = math.radians(0.1)
 _FOLLOWED = 0.3  # share of a motion that a position loop may leave undone, beyond its declared droop
 _VELOCITY_OFF = 0.2  # Share by which two travels may differ. A wrong unit makes at least a factor of 2.
 _COARSE = 0.25  # Share of the mean speed. A velocity that is reported in coarser steps tells nothing.
+_SILENT_S, _SILENT_CYCLES = 0.05, 10
+"""Where no report came for both, nobody saw the motion: 0.05 s are a sixth of a stroke of the proof."""
 
 
 @dataclass
 class Travelled:
-    """Adds up the way of a joint, there and back, by its position and by its velocity."""
+    """Adds up the way of a joint, there and back, by its position and by its velocity.
+
+    Where no report came for long, neither way counts: what the velocity was in between nobody knows, and the reports
+    that come right after a silence may be those that were missed.
+    """
 
     period_s: float  # of the set-points
     by_position_rad: float = 0.0
+    unseen_rad: float = 0.0  # by position, while no report came
     _least_rad: float = 0.0
     _most_rad: float = 0.0
     _time_s: float = 0.0
     _step_rad_s: float = math.inf
     _last: tuple[int, float, float] | None = None
+    _late_s: float = 0.0  # how much older than its time stamp a report may be, after a silence
 
     def add(self, report: Feedback, direction: float) -> None:
         """Add one report. The joint was commanded to move forward (+1), backward (-1), or to stand (0)."""
@@ -53,9 +61,16 @@ class Travelled:
             return
         now = (report.t_ns, report.position_rad, velocity)
         last, self._last = self._last, now
-        if last is None or not direction:
+        if last is None:
             return
         elapsed_s = (now[0] - last[0]) * 1e-9
+        silent_s = elapsed_s if elapsed_s > max(_SILENT_S, _SILENT_CYCLES * self.period_s) else 0.0
+        self._late_s = max(silent_s, self._late_s - elapsed_s)
+        if not direction:
+            return
+        if self._late_s > 0.0:
+            self.unseen_rad += direction * (now[1] - last[1])
+            return
         change_rad_s = abs(velocity - last[2])
         if change_rad_s > 0.0:
             self._step_rad_s = min(self._step_rad_s, change_rad_s)
@@ -73,8 +88,19 @@ class Travelled:
         return min(max(self.by_position_rad, self._least_rad), self._most_rad)
 
     def judge(self, joint: str) -> None:
-        """Compare the ways, if the velocity is fine enough (``SafetyAbort``: they tell of different motions)."""
+        """Compare the ways, if the velocity is fine enough.
+
+        ``SafetyAbort``: they tell of different motions, or nobody saw most of the motion.
+        """
         travel_rad = self.by_position_rad
+        if self.unseen_rad > max(travel_rad, 0.0):
+            raise SafetyAbort(
+                f"moved by {format_angle(self.unseen_rad)} of {format_angle(self.unseen_rad + travel_rad)} while no "
+                "report came: its velocity can't be compared with its position",
+                where=f"joint {joint}",
+                cause="the loop or the bus stood still while the joint moved",
+                next_step="run again, with nothing else at work on this computer",
+            )
         if self._time_s <= 0.0 or travel_rad <= 0.0:
             return
         if math.isfinite(self._step_rad_s) and self._step_rad_s > _COARSE * travel_rad / self._time_s:

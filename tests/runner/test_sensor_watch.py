@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from frictid_hil.errors import SafetyAbort
 from frictid_hil.protocol.driver import Feedback
 from frictid_hil.runner.sensor_watch import SensorWatch
 from frictid_hil.runner.unit_proof import Travelled
@@ -106,6 +107,30 @@ def test_the_first_motion_of_half_a_degree_is_not_judged_by_a_stall(seed):
     judged(1.0)
     with pytest.raises(Exception, match="position says"):
         judged(-1.0)
+
+
+@pytest.mark.parametrize("silent", [60, 100, 140])
+def test_a_motion_that_nobody_saw_proves_no_unit_and_refutes_none(silent):
+    def judged(said, every=500):
+        travelled = Travelled(0.001)
+        for report in burst(silent, speed=3.0, every=every):
+            travelled.add(replace(report, velocity_rad_s=report.velocity_rad_s * said), 1.0)
+        travelled.judge("3")
+
+    judged(1.0)
+    for wrong in (-1.0, 0.5, 2.0):
+        with pytest.raises(SafetyAbort, match="position says"):
+            judged(wrong)
+    with pytest.raises(SafetyAbort, match="while no report came"):
+        judged(1.0, every=silent + 20)
+
+
+def test_a_drive_that_reports_in_every_third_cycle_is_not_silent():
+    travelled = Travelled(0.02)
+    for n in range(50):
+        travelled.add(Feedback(t_ns=3 * n * 20 * MS, position_rad=0.0006 * n, velocity_rad_s=0.01), 1.0)
+    assert travelled.unseen_rad == 0.0
+    travelled.judge("3")
 
 
 def repeated(cycles, torque_nm=lambda n: 1.0, went=lambda n: n):
