@@ -1,7 +1,9 @@
-"""What half and double of each constant of the diagnosis changes, on drawn joints.
+"""What half and double of each constant of the diagnosis changes, on drawn joints and on recordings of real machines.
 
     python benchmarks/gap_sensitivity.py [--world wide] [--cases 40] [--seed 1] [--tables 10] [--jobs 2] [--write-docs]
         [--only verdict.DOUBTED ...]
+
+``--world real`` takes the sets of ``gap_real`` instead of drawn joints, all of them or the first ``--cases``.
 
 Every joint is diagnosed as it is, then once for each constant at half and at double its value. What a constant cannot
 change is computed once: recordings, tables of the channels, simulations of the same joint. Constants that enter the
@@ -19,18 +21,24 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+from gap_real import cases as real_cases
+from gap_real import real_data
 
 from frictid_hil.blind.check import draw_sealed
 from frictid_hil.config.provenance import git_revision
+from frictid_hil.errors import FrictidError
 from frictid_hil.gap import (
     actuation_channel,
     borne_out,
+    both_ways,
     command_timing,
     findings,
     forward,
@@ -44,12 +52,15 @@ from frictid_hil.gap import (
     nuisances,
     plainest,
     plant_channel,
+    position_noise,
     posterior,
     prepared,
     presliding,
     quiet,
     reading,
     residuals,
+    rigid_column,
+    tracking_channel,
     verdict,
 )
 from frictid_hil.gap import diagnose as diagnosis
@@ -62,11 +73,12 @@ DOCS_PAGE = Path(__file__).parents[1] / "docs" / "evidence" / "gap-sensitivity.m
 BEGIN, END = "<!-- written by benchmarks/gap_sensitivity.py -->", "<!-- end of what it wrote -->"
 FACTORS = (0.5, 2.0)
 LATE: tuple[tuple[ModuleType, str], ...] = (
-    (findings, "ABSENT"), (findings, "ALIKE"), (findings, "SIDED"), (findings, "UNTOLD"),
+    (findings, "ABSENT"), (findings, "ALIKE"), (findings, "SIDED"), (findings, "UNTOLD"), (findings, "EITHER"),
     (verdict, "FLOORS"), (verdict, "AS_STATED"), (verdict, "MOST_EXPECTED"), (verdict, "FLOORS_AS_STATED"),
     (verdict, "STANDS_OUT"), (verdict, "REMAINS"), (verdict, "DOUBTED"), (verdict, "HALF"),
     (verdict, "LISTED"), (verdict, "NEEDED"), (verdict, "CERTAIN"), (verdict, "EVEN"), (verdict, "LEADS"),
-    (verdict, "FORMS_OFF"), (verdict, "VARIES"),
+    (verdict, "FORMS_OFF"), (verdict, "VARIES"), (verdict, "HELPS"),
+    (both_ways, "FAIR_SHARE"), (both_ways, "TIE"), (both_ways, "LIKELY"), (reading, "READ"),
     (borne_out, "BOUNCED"), (borne_out, "REFUTED"), (borne_out, "FAR"), (link_in_loop, "LOGS"),
     (link_in_loop, "SPREAD"),
     (how_far, "COLOUR"), (how_far, "APPEARED"), (how_far, "WINDOW_S"),
@@ -76,7 +88,7 @@ LATE: tuple[tuple[ModuleType, str], ...] = (
 SEARCHED: tuple[tuple[ModuleType, str], ...] = (
     (posterior, "EXPECTED"), (posterior, "WORTH"), (posterior, "FORM"), (posterior, "EXACT_FORM"),
     (posterior, "MOST_DOUBT"), (posterior, "VISIBLE"), (posterior, "MOST"), (posterior, "TRIED"), (posterior, "POINTS"),
-    (posterior, "STRETCHES"), (plainest, "CANCELS"), (plainest, "CLEAR"),
+    (posterior, "STRETCHES"), (plainest, "CANCELS"), (plainest, "CLEAR"), (plainest, "ONE_PART"),
 )  # fmt: skip
 """The search over models."""
 TABLES: tuple[tuple[ModuleType, str], ...] = (
@@ -87,12 +99,16 @@ TABLES: tuple[tuple[ModuleType, str], ...] = (
     (reading, "COARSE"), (linear_loop, "CREEP"), (loop_channel, "STANDS_S"),
     (loop_channel, "COUNTS"), (presliding, "CLEARLY"), (residuals, "LEAST_SHARE"),
     (command_timing, "HALVED"), (command_timing, "ALIKE"),
+    (presliding, "TRAVELS"), (presliding, "SLOW_RAD_S"), (presliding, "BEGINS_RAD_S"), (presliding, "WRONG"),
+    (rigid_column, "APART"), (rigid_column, "FILTERS_HZ"), (rigid_column, "ON_AND_ON_RAD"),
+    (plant_channel, "SEVERAL"), (nuisances, "ANYWHERE"), (position_noise, "NOISE_SHARE"), (tracking_channel, "SPREAD"),
 )  # fmt: skip
 """The tables of the channels."""
 SIMULATED: tuple[tuple[ModuleType, str], ...] = ((forward, "RIGID_SUBSTEP_S"),)
 """The joint under its controller."""
 CHANCES = (
     "SIDED", "DOUBTED", "NEEDED", "CERTAIN", "LEADS", "EVEN", "UNTOLD", "REFUTED", "UNDECIDED", "LISTED", "CLEARLY",
+    "EITHER", "HELPS", "FAIR_SHARE", "TIE", "LIKELY", "READ", "ONE_PART",
 )  # fmt: skip
 
 Answer = tuple[str, str]
@@ -101,7 +117,7 @@ Answer = tuple[str, str]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--world", choices=("narrow", "wide"), default="wide")
+    parser.add_argument("--world", choices=("narrow", "wide", "zoo", "real"), default="wide")
     parser.add_argument("--cases", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--tables", type=int, default=10, help="joints on which constants of the tables are varied")
@@ -129,37 +145,56 @@ Row = list[int]
 """Joints, verdicts changed, first causes changed, right answers; of the same joints as it is: right answers."""
 
 
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One joint, and the first answers that are right."""
+
+    load: Callable[[], ExperimentSet]
+    right: tuple[str, ...]
+
+
 def measured(world: str, cases: int, seed: int, tables: int, jobs: int, only: frozenset[str]) -> dict[str, Row]:
     """What was counted, by what was varied."""
     with tempfile.TemporaryDirectory(prefix="frictid-sensitivity-") as folder:
-        sealed = draw_sealed(world, cases, seed, Path(folder), jobs, lambda *_: None)
-        names = sorted(sealed.truths)
+        joints = real()[:cases] if world == "real" else drawn(world, cases, seed, Path(folder), jobs)
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            whole = [k < tables for k in range(len(names))]
-            folders = [sealed.folder / name for name in names]
-            answers = list(pool.map(all_answers, folders, whole, itertools.repeat(only)))
+            whole = [k < tables for k in range(len(joints))]
+            answers = list(pool.map(all_answers, [one.load for one in joints], whole, itertools.repeat(only)))
     rows: dict[str, Row] = {}
-    for name, answer in zip(names, answers, strict=True):
+    for joint, answer in zip(joints, answers, strict=True):
         plain = answer["as it is"]
         for what, one in answer.items():
             row = rows.setdefault(what, [0, 0, 0, 0, 0])
-            was, is_now = right(sealed.truths[name], plain), right(sealed.truths[name], one)
+            was, is_now = plain[1] in joint.right, one[1] in joint.right
             changes = (1, one[0] != plain[0], one[1] != plain[1], is_now, was)
             rows[what] = [a + int(b) for a, b in zip(row, changes, strict=True)]
     return rows
 
 
-def right(truth: Mapping[str, Any], answer: Answer) -> bool:
-    """Whether the first cause is one that acts; ``none`` of a healthy joint, ``unknown`` of what has no name."""
+def drawn(world: str, cases: int, seed: int, folder: Path, jobs: int) -> list[Case]:
+    """Joints of a world of the blind check."""
+    sealed = draw_sealed(world, cases, seed, folder, jobs, lambda *_: None)
+    load = ExperimentSet.load
+    return [Case(partial(load, sealed.folder / name), right(truth)) for name, truth in sorted(sealed.truths.items())]
+
+
+def real() -> list[Case]:
+    """Recordings of real machines, every fifth of a kind first, so that a few of them are of many machines."""
+    known = list(real_cases(real_data(), real_data("FRICTID_REAL_MORE_DATA", "real-more")))
+    mixed = [one for first in range(5) for one in known[first::5]]
+    return [Case(load, truth.accept) for _, _, truth, load in mixed]
+
+
+def right(truth: Mapping[str, Any]) -> tuple[str, ...]:
+    """The first cause: one that acts; ``none`` of a healthy joint, ``unknown`` of what has no name."""
     if truth["kind"] in ("none", "outside"):
-        return answer[0] == {"none": "none", "outside": "unknown"}[truth["kind"]]
-    named = truth.get("main") or [effect["name"] for effect in truth["effects"]]
-    return answer[1] in named
+        return ({"none": "none", "outside": "unknown"}[truth["kind"]],)
+    return tuple(truth.get("main") or [effect["name"] for effect in truth["effects"]])
 
 
-def all_answers(case: Path, tables: bool, only: frozenset[str]) -> dict[str, Answer]:
+def all_answers(load: Callable[[], ExperimentSet], tables: bool, only: frozenset[str]) -> dict[str, Answer]:
     """The answer as it is, and with each of the given constants at half and at double."""
-    experiments = ExperimentSet.load(case)
+    experiments = load()
     answers: dict[str, Answer] = {}
 
     def vary(constants: Sequence[tuple[ModuleType, str]]) -> None:
@@ -230,7 +265,10 @@ def same_tables() -> Callable[[Channel, int], Posterior]:
 
 
 def _answer(experiments: ExperimentSet) -> Answer:
-    told = diagnosis.diagnose(experiments, negligible=quiet.NEGLIGIBLE)
+    try:
+        told = diagnosis.diagnose(experiments, negligible=quiet.NEGLIGIBLE)
+    except FrictidError:
+        return "refused", "refused"
     named = told.causes and told.verdict in ("explained", "ambiguous")
     return told.verdict, told.causes[0].effect if named else told.verdict
 

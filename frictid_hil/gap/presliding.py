@@ -29,8 +29,8 @@ FURTHER = (
     "{was:.2g} rad"
 )
 TRAVEL = "no presliding stiffness is stated: friction builds up over {now:.2g} rad in these recordings"
-TRAVELS = (0.04, 0.2, 1.0, 5.0, 25.0)
-"""Travels that are tried where none is stated, over the usual one: from a ball bearing to a soft harmonic drive."""
+TRAVELS = (0.04, 0.2, 5.0, 25.0)
+"""Travels that are tried beside the usual one, over it, where none is stated: a ball bearing's to a soft gear's."""
 SLOW_RAD_S = (0.01, 0.05)
 """Speeds over which friction may fall when sliding begins: what a Stribeck effect makes is not the form's."""
 BEGINS_RAD_S = 0.02  # speed at which friction counts as that of a joint that begins to slide
@@ -65,7 +65,7 @@ def _with_best_travel(experiments: ExperimentSet, logs: Sequence[Recording]) -> 
     forms = [replace(nominal, presliding_travel_rad=f * nominal.presliding_travel_rad) for f in TRAVELS]
     left = [_fit(logs, form)[0] for form in forms]
     best = int(np.argmin(left))
-    if left[best] > CLEARLY * left[TRAVELS.index(1.0)]:
+    if left[best] > CLEARLY * _fit(logs, nominal)[0]:
         return experiments, None
     told = TRAVEL.format(now=forms[best].presliding_travel_rad)
     return replace(experiments, nominal=forms[best]), told
