@@ -151,6 +151,7 @@ class Drive(Open):
     torque_delay_s: NotNegative | None = None  # from demand to torque
     current_lag_s: NotNegative | None = None  # time constant from demand to current
     torque_report_filter: ReportFilter | None = None  # low-pass on the reported torque
+    torque_smoothed_hz: Positive | None = None  # low-pass, forwards and backwards, on the recorded torque
 
 
 class Encoder(Open):

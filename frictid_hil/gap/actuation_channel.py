@@ -89,7 +89,7 @@ def actuation_channel(
             spread, ends = (0.3, NEAREST) if form.late else (0.1, (-math.inf, math.inf))
             candidates.append(Term(name, value, numbers, np.ones(1), np.full(1, spread), *ends))
     candidates += families_of(_generic(logs, base), scale, builder)
-    low_pass, report = LowPass.at(1.0 / logs[0].step_s), nominal.torque_report_filter
+    low_pass, report = logs[0].low_pass, nominal.torque_report_filter
     told = zip(logs, builder.parts, residuals, strict=True)
     rows = [rows_of(r, columns, residual, low_pass, report=report) for r, columns, residual in told]
     rows = without_nuisances(rows, nuisances, candidates)
@@ -103,7 +103,7 @@ def actuation_channel(
         scale,
         low_pass.cutoff_hz,
         # A demand that is known exactly leaves the torque's own noise, and nothing that a model may take for noise.
-        known_floor=math.inf if between else white_nm(logs, low_pass),
+        known_floor=math.inf if between or logs[0].experiment.smoothed else white_nm(logs, low_pass),
         between_rows=between,
     )
 

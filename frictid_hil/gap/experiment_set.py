@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import itertools
+import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -101,6 +102,7 @@ class Nominal:
     torque_quantum_nm: float | None = None  # step of the reported torque
     # Declared low-pass of the reported torque; None where none is declared.
     torque_report_filter: ReportFilter | None = None
+    torque_smoothed_hz: float | None = None  # of the low-pass without lag that its logs passed; None: they tell
     # What the file already says of the drive (its delay, its current loop), as effects by name.
     believed_effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     encoder_resolution_rad: float | None = None  # step of the reported position, joint side
@@ -126,6 +128,12 @@ class Experiment:
     rigid_body_torque_nm: Array | None = None  # the part that the user's own rigid-body model explains
     temperature_c: Array | None = None  # of motor or gear
     torque_demand_nm: Array | None = None  # the controller's own demand, where the log brings it
+    band_hz: float = math.inf  # above which the torque holds nothing, because it was smoothed after it was recorded
+
+    @property
+    def smoothed(self) -> bool:
+        """Whether the torque holds no noise any more that tells its size."""
+        return math.isfinite(self.band_hz)
 
     @property
     def step_s(self) -> float:
@@ -243,6 +251,7 @@ def _nominal(file: NominalFile, document: Mapping[str, Any], where: str) -> Nomi
         controller=None if file.controller is None else _controller(file.controller),
         rated_torque_nm=drive.rated_torque_nm,
         torque_quantum_nm=drive.torque_quantum_nm,
+        torque_smoothed_hz=drive.torque_smoothed_hz,
         torque_report_filter=report if report and report.time_constant_s > 0.0 else None,
         believed_effects=_believed_effects(document.get("drive") or {}),
         encoder_resolution_rad=encoder.resolution_rad,

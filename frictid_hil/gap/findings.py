@@ -14,7 +14,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, STIFFNESS, Channel, Term
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.plainest import CANCELS, plainest
-from frictid_hil.gap.posterior import FORM, VISIBLE, Draw, Posterior, by_term, form_of, joined
+from frictid_hil.gap.posterior import EXACT_FORM, FORM, VISIBLE, Draw, Posterior, by_term, form_of, joined
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -96,7 +96,7 @@ def sampled(posterior: Posterior) -> Sampled:
         # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
         named = {**causes, **({"": parts[""]} if "" in parts else {})}
         inner = _products(list(named.values()), gram)
-        told = _net(inner, np.array([form_of(name) for name in named]), np.array([name in sided for name in named]))
+        told = _net(inner, _forms(list(named)), np.array([name in sided for name in named]))
         for effect, net, blur in zip(causes, *told, strict=False):
             sizes[effect][k] = net / posterior.floor
             signs[effect][k] = np.sign(np.sum(causes[effect][1])) if effect in sided else 1.0
@@ -150,11 +150,21 @@ def _size(inner: Array) -> float:
     return math.sqrt(max(0.0, float(np.sum(inner))))
 
 
+def _forms(names: Sequence[str]) -> Array:
+    """One-sigma of what each cause (second axis) puts beyond its form on each (first axis), over its size, (p, p).
+
+    No joint is off its form by lines over position, but where lines are the form.
+    """
+    forms = np.array([form_of(name) for name in names])
+    lines = np.array([name in all_effects() and all_effects()[name].is_line for name in names], dtype=bool)
+    return np.where(lines[:, None] & ~lines, np.minimum(forms, EXACT_FORM), forms)
+
+
 def _net(inner: Array, forms: Array, beliefs: np.ndarray) -> tuple[Array, Array]:
     """(RMS of what each cause makes less what others take back, one-sigma of what their forms may have put on it).
 
-    ``inner`` holds the mean products of what the causes make; ``forms`` is how far each may be off its form, over its
-    size; ``beliefs`` are errors of one believed number each.
+    ``inner`` holds the mean products of what the causes make; ``forms`` is how far each of the others may be off its
+    form in the way that one moves, over its size, (p, p); ``beliefs`` are errors of one believed number each.
 
     A pair that more than half cancels explains nothing. Of an error of the belief only that counts which the sum of
     all of them has along it: a torque constant takes back what inertia, gravity and friction make that are off alike.

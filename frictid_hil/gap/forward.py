@@ -219,13 +219,13 @@ class Replay:
 
     def _one(self, model: JointModel, experiment: Experiment, state: CarryOver | None) -> tuple[Replayed, CarryOver]:
         rows = self._rows(model, experiment, state)
-        low_pass = LowPass.at(1.0 / experiment.step_s)
+        low_pass = LowPass.at(1.0 / experiment.step_s, experiment.band_hz)
         measured = experiment.torque_nm
         torque = np.zeros_like(rows.torque_nm) if measured is None else measured - rows.torque_nm
         held = first_slide(experiment.position_rad, self._slide_rad) + round(SETTLING_S * low_pass.rate_hz)
         return Replayed(
             low_pass(torque),
-            low_pass(experiment.position_rad - rows.position_rad),
+            LowPass.at(low_pass.rate_hz)(experiment.position_rad - rows.position_rad),
             min(held, experiment.time_s.size // 3),
         ), rows.state
 

@@ -45,7 +45,7 @@ def loop_channel(
     left = [replace(v, torque_nm=v.torque_nm + gap.torque_nm) for v, gap in zip(views, gaps, strict=True)]
     scale = rms(np.concatenate([gap.torque_nm[gap.settled :] for gap in gaps]))
     builder, known, candidates = terms_of(nominal, views, left, believed, library, estimated, scale)
-    low_pass = LowPass.at(1.0 / believed[0].step_s)
+    low_pass = believed[0].low_pass
     report = nominal.torque_report_filter
     assert nominal.controller is not None
     shares = beside.get("controller_gain_error")

@@ -29,7 +29,6 @@ from frictid_hil.gap.nuisances import bent_rate_nm, nuisances
 from frictid_hil.gap.position_noise import differenced_rms, quiet_views, white_rms
 from frictid_hil.gap.residuals import LowPass, Recording, first_slide, reported, rms
 from frictid_hil.gap.rigid_column import about_its_level
-from frictid_hil.simulation.effect import Region
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import View
 
@@ -76,9 +75,9 @@ def plant_channel(
         noises = [max(pair, key=rms) for pair in zip(noises, folded, strict=True)]
     measured = [r.view for r in logs if r.view is not None]
     friction_nm = rms(np.concatenate([v.coulomb_nm * v.slip + v.rate_nm for v in views]))
-    scale = min(friction_nm / 3.0, _gap_nm(residuals, logs[0].step_s))
+    scale = min(friction_nm / 3.0, _gap_nm(residuals, logs[0].low_pass))
     builder, known, candidates = terms_of(nominal, views, measured, logs, library, estimated, scale)
-    low_pass = band(residuals, logs[0].step_s, candidates if lines else (), builder.parts)
+    low_pass = band(residuals, logs[0].low_pass, candidates if lines else (), builder.parts)
     rows = []
     for r, v, residual, noise, columns in zip(logs, measured, residuals, noises, builder.parts, strict=True):
         held = first_slide(v.position_rad, 3.0 * v.coulomb_nm / v.stiffness_nm_per_rad)
@@ -89,6 +88,7 @@ def plant_channel(
     rows = heard(rows, white, views[0].coulomb_nm, step_s)
     raw = _raw(logs, residuals, noises)
     known_floor = math.hypot(white, rms(np.concatenate([log.known_noise[log.told] for log in rows])))
+    known_floor = math.inf if logs[0].experiment.smoothed else known_floor
     return Channel(
         "plant", step_s, tuple(rows), tuple(known), tuple(candidates), scale, low_pass.cutoff_hz, raw, known_floor
     )
@@ -167,9 +167,13 @@ def _family(name: str, size: float, numbers: tuple[int, ...], columns: Sequence[
 
 
 def _raw(logs: Sequence[Recording], residuals: Sequence[Array], noises: Sequence[Array]) -> tuple[float, float]:
-    """(RMS of the residual of the validation logs before any filter, what noise of torque and position leaves), N m."""
+    """(RMS of the residual of the validation logs before any filter, what noise of torque and position leaves), N m.
+
+    A torque that was smoothed after it was recorded can be compared behind that filter alone.
+    """
     chosen = [k for k, r in enumerate(logs) if r.experiment.validation] or list(range(len(logs)))
-    gap = rms(np.concatenate([residuals[k] for k in chosen]))
+    smoothed = logs[0].experiment.smoothed
+    gap = rms(np.concatenate([logs[k].low_pass(residuals[k]) if smoothed else residuals[k] for k in chosen]))
     white = [white_rms(t) for k in chosen if (t := logs[k].experiment.torque_nm) is not None]
     own = [differenced_rms(t) for k in chosen if (t := logs[k].experiment.rigid_body_torque_nm) is not None]
     noise = math.hypot(rms(np.concatenate([noises[k] for k in chosen])), rms(np.array(white)))
@@ -199,9 +203,8 @@ def heard(rows: Sequence[Rows], white_nm: float, coulomb_nm: float, step_s: floa
     return [replace(log, told=size <= most_nm) for log, size in zip(rows, local, strict=True)]
 
 
-def _gap_nm(residuals: Sequence[Array], step_s: float) -> float:
+def _gap_nm(residuals: Sequence[Array], low_pass: LowPass) -> float:
     """RMS of the residual behind the usual low-pass, N m."""
-    low_pass = LowPass.at(1.0 / step_s)
     return rms(np.concatenate([low_pass(residual)[5:-5] for residual in residuals]))
 
 
@@ -222,28 +225,22 @@ def without_nuisances(logs: Sequence[Rows], nuisances: Sequence[Term], candidate
 
 
 def band(
-    residuals: Sequence[Array], step_s: float, candidates: Sequence[Term], parts: Sequence[Sequence[Array]]
+    residuals: Sequence[Array], usual: LowPass, candidates: Sequence[Term], parts: Sequence[Sequence[Array]]
 ) -> LowPass:
-    """The low-pass: 20 Hz, or as much more as lines over position need that stand above it.
+    """The low-pass: the usual one, or as much wider as lines over position need that stand above 20 Hz.
 
     Noise of the position grows with frequency, so that no more is let through than a cause can use.
     """
-    rate = 1.0 / step_s
-    usable = [hertz for hertz in BANDS_HZ if hertz <= 0.2 * rate] or [0.2 * rate]
-    lines = [t for t in candidates if not t.effect.startswith(FAMILY) and is_line(t.effect)]
+    rate = usual.rate_hz
+    if usual.cutoff_hz < BANDS_HZ[0]:
+        return usual
+    usable = [hertz for hertz in BANDS_HZ if hertz <= 0.2 * rate]
+    lines = [t for t in candidates if t.effect in all_effects() and all_effects()[t.effect].is_line]
     if len(usable) == 1 or not lines:
         return LowPass(rate, usable[0])
     tables = [[taken(part, t.columns, LINE_ROWS) for part in parts] for t in lines]
     worth = [h for h in usable if max(_described(residuals, table, LowPass(rate, h)) for table in tables) > LINE_SHARE]
     return LowPass(rate, next((h for h in usable if not worth or h > worth[-1]), usable[-1]))
-
-
-def is_line(effect: str) -> bool:
-    """Whether an effect looks for lines over position in the recordings themselves."""
-    form = all_effects()[effect].inverse
-    return (
-        form is not None and form.shapes_for is not None and Region.POSITION in all_effects()[effect].signature.regions
-    )
 
 
 def _described(residuals: Sequence[Array], tables: Sequence[Array], low_pass: LowPass) -> float:

@@ -15,8 +15,9 @@ from frictid_hil.gap.kinematics import fit_kinematics
 from frictid_hil.gap.position_noise import white_rms
 from frictid_hil.gap.presliding import as_it_yields
 from frictid_hil.gap.report_filter import as_meant
-from frictid_hil.gap.residuals import LowPass, Recording, recordings, rms
+from frictid_hil.gap.residuals import Recording, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
+from frictid_hil.gap.smoothing import as_smoothed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,9 +46,11 @@ class Prepared:
 
 def prepared(experiments: ExperimentSet, library: Collection[str]) -> Prepared:
     """The set made ready; ``library`` holds the effects that may be used."""
-    experiments, reasons = completed(in_force(as_meant(checked(experiments))))
+    experiments, smoothed = as_smoothed(checked(experiments))
+    experiments, reasons = completed(in_force(as_meant(experiments)))
     experiments, form = as_it_yields(experiments)
-    reasons = {**reasons, **({} if form is None else {"presliding": form})}
+    told = {"band": smoothed, "presliding": form}
+    reasons = {**reasons, **{name: why for name, why in told.items() if why is not None}}
     if (open_question := one_sided(experiments)) is not None:
         reasons["motion"] = open_question
     if one_sinusoid(experiments):
@@ -94,5 +97,5 @@ def _white_nm(logs: Sequence[Recording]) -> float:
     """RMS that white noise of the reported torque leaves behind the low-pass, on the logs a gap is told of, N m."""
     role = judged_role(logs)
     judged = [r for r in logs if role is None or r.experiment.validation]
-    gain = LowPass.at(1.0 / logs[0].step_s).white_gain
+    gain = logs[0].low_pass.white_gain
     return gain * rms(np.array([white_rms(t) for r in judged if (t := r.experiment.torque_nm) is not None] or [0.0]))

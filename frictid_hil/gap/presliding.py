@@ -18,7 +18,7 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.forward import Replay, pooled, why_not
-from frictid_hil.gap.residuals import LowPass, Recording, presliding_state, recordings
+from frictid_hil.gap.residuals import Recording, presliding_state, recordings
 
 GRADUALLY = (
     "the file states a presliding stiffness and not how presliding yields: 'gradually' (Dahl, LuGre) fits these "
@@ -103,7 +103,7 @@ def _fit(logs: Sequence[Recording], form: Nominal) -> tuple[float, float]:
     """(squares of the torque that one form leaves, friction where sliding begins), belief and Stribeck fitted along."""
     tables = []
     for log in logs:
-        v, low_pass = log.view, LowPass.at(1.0 / log.step_s)
+        v, low_pass = log.view, log.low_pass
         assert v is not None and log.plant_nm is not None
         state = presliding_state(form, v.position_rad)
         falling = [state * np.exp(-np.abs(v.velocity_rad_s) / slow) for slow in SLOW_RAD_S]

@@ -13,7 +13,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import ExperimentSet
-from frictid_hil.gap.residuals import LowPass, Recording, recordings
+from frictid_hil.gap.residuals import Recording, recordings
 from frictid_hil.gap.sanity import completed
 
 BINS = 48
@@ -98,7 +98,7 @@ def missing_torque(experiments: ExperimentSet) -> tuple[Profile, ...]:
 
 def _smooth(recording: Recording, column: Array | None) -> Array:
     assert column is not None
-    return LowPass.at(1.0 / recording.step_s)(column)
+    return recording.low_pass(column)
 
 
 def _binned(name: str, x: Array, y: Array) -> Curve:
@@ -146,7 +146,7 @@ def _by_second(logs: Sequence[Recording]) -> tuple[Array, Array]:
 
 def _spectrum(logs: Sequence[Recording]) -> Profile:
     """Mean square by frequency, in bands of equal width, over all logs."""
-    edges = np.linspace(0.0, LowPass.at(1.0 / logs[0].step_s).cutoff_hz, 41)
+    edges = np.linspace(0.0, logs[0].low_pass.cutoff_hz, 41)
     sums, rows = np.zeros(40), 0
     for recording in logs:
         residual = _smooth(recording, recording.plant_nm)

@@ -20,7 +20,7 @@ from frictid_hil.gap.forward import Effects, Simulation
 from frictid_hil.gap.how_far import Closed, closed
 from frictid_hil.gap.link_in_loop import link_in_loop
 from frictid_hil.gap.loop_channel import loop_channel
-from frictid_hil.gap.plant_channel import is_line, plant_channel
+from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.posterior import Posterior
 from frictid_hil.gap.prepared import Prepared
 from frictid_hil.gap.residuals import CUTOFF_HZ, rms
@@ -65,7 +65,7 @@ def along_the_motion(joint: Prepared, allowed: Sequence[str]) -> Reading:
     reasons = dict(joint.reasons)
     channels = [sampled(Posterior(c, len(allowed))) for c in _channels(joint, allowed, reasons)]
     reading = Reading(allowed, channels, *_read(channels, joint, allowed), reasons)
-    if _widened(channels) and not any(is_line(f.effect) for f in reading.found if f.chance >= EVEN):
+    if _widened(channels) and not any(all_effects()[f.effect].is_line for f in reading.found if f.chance >= EVEN):
         reading = _read_again(joint, reading, allowed, reasons, lines=False)
     return reading
 

@@ -9,7 +9,7 @@ import numpy as np
 from frictid_hil.config.nominal import ReportFilter
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.presliding import CLEARLY
-from frictid_hil.gap.residuals import LowPass, Recording, held, recordings, reported
+from frictid_hil.gap.residuals import Recording, held, recordings, reported
 
 
 def as_meant(experiments: ExperimentSet) -> ExperimentSet:
@@ -40,6 +40,6 @@ def _left(recording: Recording, form: ReportFilter) -> float:
     if recording.demand_nm is not None and recording.experiment.torque_nm is not None:
         columns, measured = [held(recording.demand_nm)], recording.experiment.torque_nm
     model = np.stack([*columns, np.ones_like(measured)], axis=1)
-    table = LowPass.at(1.0 / step_s)(np.concatenate([reported(model, form, step_s), measured[:, None]], axis=1))
+    table = recording.low_pass(np.concatenate([reported(model, form, step_s), measured[:, None]], axis=1))
     weights = np.linalg.lstsq(table[:, :-1], table[:, -1], rcond=None)[0]
     return float(np.sum((table[:, -1] - table[:, :-1] @ weights) ** 2))

@@ -57,6 +57,11 @@ class Recording:
     actuation_nm: Array | None  # A, unfiltered
     kinematic_rad_s: Array | None  # K
 
+    @property
+    def low_pass(self) -> LowPass:
+        """That of whatever is compared with its torque."""
+        return LowPass.at(1.0 / self.step_s, self.experiment.band_hz)
+
 
 @dataclass(frozen=True, slots=True)
 class LowPass:
@@ -66,9 +71,9 @@ class LowPass:
     cutoff_hz: float
 
     @staticmethod
-    def at(rate_hz: float) -> LowPass:
-        """The filter for a sampling rate."""
-        return LowPass(rate_hz, min(CUTOFF_HZ, 0.2 * rate_hz))
+    def at(rate_hz: float, band_hz: float = math.inf) -> LowPass:
+        """The filter for a sampling rate, and for a torque that holds nothing above ``band_hz``."""
+        return LowPass(rate_hz, min(CUTOFF_HZ, 0.2 * rate_hz, band_hz))
 
     def __call__(self, columns: Array) -> Array:
         """Filtered along the first axis; shape unchanged."""
@@ -157,7 +162,7 @@ def _late_of_row(experiments: ExperimentSet) -> float | None:
             continue
         e, step_s, _ = uniform(raw)
         view = view_of(nominal, e, step_s, 0.0, 0.0)
-        low_pass = LowPass.at(1.0 / step_s)
+        low_pass = LowPass.at(1.0 / step_s, e.band_hz)
         parts = [view.acceleration_rad_s2, view.slip, view.velocity_rad_s, np.cos(e.position_rad)]
         rigid = e.rigid_body_torque_nm
         model = np.stack([*parts, np.ones_like(view.slip), *([] if rigid is None else [rigid])], axis=1)

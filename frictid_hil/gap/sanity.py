@@ -276,7 +276,7 @@ def completed(experiments: ExperimentSet) -> tuple[ExperimentSet, dict[str, str]
 def _rigid_columns(e: Experiment, nominal: Nominal, given: bool) -> Array:
     """Columns of inertia, gravity and friction, and the torque last, behind the low-pass, shape (rows, 6)."""
     step_s, q = e.step_s, e.position_rad
-    low_pass = LowPass.at(1.0 / step_s)
+    low_pass = LowPass.at(1.0 / step_s, e.band_hz)
     velocity = np.gradient(q, step_s)
     acceleration = np.zeros_like(q)
     acceleration[1:-1] = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / step_s**2

@@ -75,7 +75,7 @@ def where(
 
     logs = []
     for recording in every:
-        low_pass = LowPass.at(1.0 / recording.step_s)
+        low_pass = recording.low_pass
         row_s = recording.step_s * low_pass.stride
         floor = noise_nm**2 * row_s
         for region, residual in _of_drive(recording, low_pass, velocity_gain_nm_s_per_rad):
@@ -206,7 +206,7 @@ def _families(log: _Log, top: float, end_s: float, warm_c: float) -> dict[Region
         # Friction in the middle of the set is friction at some speed; only what changes from there is time's.
         Region.TEMPERATURE: [friction * (late - 0.5), friction * (late - 0.5) ** 2, friction * warmer],
     }
-    low_pass = LowPass.at(1.0 / log.recording.step_s)
+    low_pass = log.recording.low_pass
     thin = low_pass.thinned(np.stack([c for family in raw.values() for c in family], axis=1))
     ends = np.cumsum([len(family) for family in raw.values()])
     result = dict(zip(raw, np.split(thin, ends[:-1], axis=1), strict=True))

@@ -160,6 +160,12 @@ class Effect:
         """Whether it lets the link swing by itself."""
         return self.inverse is not None and self.inverse.swings
 
+    @property
+    def is_line(self) -> bool:
+        """Whether it looks for lines over position in the recordings themselves."""
+        looks = self.inverse is not None and self.inverse.shapes_for is not None
+        return looks and Region.POSITION in self.signature.regions
+
     def complete(self, given: Mapping[str, float]) -> dict[str, float]:
         """All parameters: the given ones, typical values for shapes left out, off for strengths left out."""
         return {**self.off, **given}

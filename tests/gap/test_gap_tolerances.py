@@ -173,8 +173,10 @@ def test_errors_of_a_cascades_gains_act_alike_in_demand_and_simulator() -> None:
     """kp 10 % higher, ki 20 % lower, kv 15 % lower: shares of kv*kp, ki*kp and kv, and ki with all three."""
     shares = {"kp_error_share": 1.1 * 0.85 - 1.0, "ki_error_share": 1.1 * 0.8 - 1.0, "kd_error_share": 0.85 - 1.0}
     rows, command = _cascaded(CASCADE, controller_gain_error=shares)
-    told = {"position_command_rad": command, "torque_nm": rows.torque_nm}
-    log = Experiment("a", False, False, 0, 0.002 * np.arange(1500), rows.position_rad, **told)
+    time_s = 0.002 * np.arange(1500)
+    log = Experiment(
+        "a", False, False, 0, time_s, rows.position_rad, position_command_rad=command, torque_nm=rows.torque_nm
+    )
     left = rows.torque_nm[1:] - demand_of(CASCADE, log, 0.002)[:-1]
     made = (demand_parts(CASCADE, log, 0.002, list(shares.values())) @ list(shares.values()))[:-1]
     assert np.std(left[50:]) > 10.0 * np.std((left - made)[50:])

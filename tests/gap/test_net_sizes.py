@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from frictid_hil.gap.findings import _net
+from frictid_hil.gap.findings import _forms, _net
 
 
 def net(parts: list[list[float]], beliefs: list[bool]) -> np.ndarray:
@@ -29,3 +29,9 @@ def test_an_error_of_the_belief_takes_nothing_back_from_a_cause() -> None:
 
 def test_errors_that_add_count_for_their_own_size() -> None:
     assert net([[1.0, 0.0], [1.0, 1.0]], [True, True]) == pytest.approx([0.71, 1.0], abs=0.01)
+
+
+def test_only_lines_over_position_are_taken_for_lines_over_position() -> None:
+    forms = _forms(["torque_bias", "torque_ripple", "stribeck"])
+    assert forms[1] == pytest.approx([0.02, 0.1, 0.02]), "what the others, and itself, may put on a ripple"
+    assert forms[0] == pytest.approx([0.1, 0.1, 0.1])

@@ -59,7 +59,7 @@ def _table(log: Experiment) -> Array:
     """Columns in the order of the numbers, the torque last; low-passed and thinned, shape (m, 7)."""
     even, step_s, _ = uniform(log)
     assert even.torque_nm is not None
-    low_pass = LowPass.at(1.0 / step_s)
+    low_pass = LowPass.at(1.0 / step_s, even.band_hz)
     q = even.position_rad
     velocity = np.gradient(q, step_s)
     acceleration = np.zeros_like(q)
