@@ -118,6 +118,8 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     channels, gaps, reasons = reading.channels, reading.gaps, dict(reading.reasons)
     nothing_nm = negligible_nm(joint.nominal, channels, negligible)
     quiet = quiet_before_any_filter(reading.measured, negligible)
+    # Nothing tells how loud a smoothed torque's noise was: there only a gap that means nothing in practice is none.
+    quiet = quiet and (not joint.smoothed or all(gap.anywhere <= nothing_nm for gap in gaps))
     small = quiet and (joint.simulation is None or pooled(joint.simulation.bare, "torque_nm") <= HALF * nothing_nm)
     if quiet and joint.simulation is not None:
         quiet = quiet_in_the_loop(joint.simulation, reading.found, channels, gaps, nothing_nm, guessed=joint.guessed)

@@ -39,6 +39,11 @@ class Prepared:
         return self.experiments.nominal
 
     @property
+    def smoothed(self) -> bool:
+        """Whether its torques were smoothed after they were recorded."""
+        return self.logs[0].experiment.smoothed
+
+    @property
     def guessed(self) -> bool:
         """Whether a controller's demand is a guess, as it falls between rows of the log."""
         return is_guessed(self.nominal, self.logs[0].experiment)

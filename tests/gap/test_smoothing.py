@@ -96,5 +96,22 @@ def test_a_cause_keeps_its_name_and_its_numbers_when_the_torque_is_smoothed(caus
     assert told.raw is not None and told.raw.cutoff_hz < 8.0
 
 
+def test_pushes_in_a_smoothed_torque_are_no_noise() -> None:
+    """Nothing tells how loud its noise was; what no model says must not be taken for it."""
+    random = np.random.default_rng(5)
+
+    def pushed(e: Experiment) -> Experiment:
+        assert e.torque_nm is not None
+        times_s = random.uniform(e.time_s[0], e.time_s[-1], 12)
+        hands = sum(
+            (random.choice([-3.0, 3.0]) * np.exp(-(((e.time_s - t) / 0.2) ** 2)) for t in times_s), 0.0 * e.time_s
+        )
+        return replace(e, torque_nm=e.torque_nm + hands)
+
+    joint = made()
+    joint = replace(joint, experiments=tuple(pushed(e) for e in joint.experiments))
+    assert diagnose(smoothed(joint, 8.0)).verdict == "unknown"
+
+
 def test_a_healthy_joint_stays_healthy_when_its_torque_is_smoothed() -> None:
     assert diagnose(smoothed(made(), 8.0)).verdict == "none"
