@@ -53,7 +53,6 @@ from frictid_hil.config.provenance import git_revision
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.config.write import dump
 from frictid_hil.errors import Defect, FrictidError
-from frictid_hil.gap.experiments import plan_document
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.check import check
 from frictid_hil.jobs.compare import true_curve
@@ -63,6 +62,7 @@ from frictid_hil.jobs.gap_record import GapRecordOptions, record
 from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
 from frictid_hil.jobs.reset import reset
 from frictid_hil.jobs.watch import Silent
+from frictid_hil.plan.experiments import plan_document
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import JointSetup, RobotSetup

@@ -60,6 +60,7 @@ from frictid_hil.gap import (
     reading,
     residuals,
     rigid_column,
+    smoothing,
     tracking_channel,
     verdict,
 )
@@ -101,6 +102,8 @@ TABLES: tuple[tuple[ModuleType, str], ...] = (
     (command_timing, "HALVED"), (command_timing, "ALIKE"),
     (presliding, "TRAVELS"), (presliding, "SLOW_RAD_S"), (presliding, "BEGINS_RAD_S"), (presliding, "WRONG"),
     (rigid_column, "APART"), (rigid_column, "FILTERS_HZ"), (rigid_column, "ON_AND_ON_RAD"),
+    (smoothing, "CLIFF_DB"), (smoothing, "SILENT_DB"), (smoothing, "BELOW_DB"), (smoothing, "OWN_DB"),
+    (smoothing, "LEAST_HZ"), (smoothing, "MOST_HZ"), (smoothing, "KEPT"), (smoothing, "PART_S"),
     (plant_channel, "SEVERAL"), (nuisances, "ANYWHERE"), (position_noise, "NOISE_SHARE"), (tracking_channel, "SPREAD"),
 )  # fmt: skip
 """The tables of the channels."""
@@ -108,7 +111,7 @@ SIMULATED: tuple[tuple[ModuleType, str], ...] = ((forward, "RIGID_SUBSTEP_S"),)
 """The joint under its controller."""
 CHANCES = (
     "SIDED", "DOUBTED", "NEEDED", "CERTAIN", "LEADS", "EVEN", "UNTOLD", "REFUTED", "UNDECIDED", "LISTED", "CLEARLY",
-    "EITHER", "HELPS", "FAIR_SHARE", "TIE", "LIKELY", "READ", "ONE_PART",
+    "EITHER", "HELPS", "FAIR_SHARE", "TIE", "LIKELY", "READ", "ONE_PART", "KEPT",
 )  # fmt: skip
 
 Answer = tuple[str, str]

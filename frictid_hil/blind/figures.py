@@ -23,7 +23,7 @@ from frictid_hil.blind import plant
 from frictid_hil.blind.joints import Joint, ticks
 from frictid_hil.blind.plant import TICK_S, Controller, Physics
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.experiments import Experiment
+from frictid_hil.plan.experiments import Experiment
 
 CUTOFF_HZ = 25.0
 FIGURES = ("inverse_nm", "actuation_nm", "velocity_rad_s", "forward_torque_nm", "forward_position_rad")

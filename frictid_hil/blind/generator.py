@@ -22,7 +22,7 @@ from frictid_hil.blind.figures import Log, believed_motion, figures, record, tog
 from frictid_hil.blind.joints import Joint, draw_joint, nominal_mapping
 from frictid_hil.blind.plant import TICK_S
 from frictid_hil.blind.score import PRACTICAL
-from frictid_hil.gap.experiments import FULL
+from frictid_hil.plan.experiments import FULL
 
 ALIASES = (  # pairs that these columns can hardly separate
     ("torque_bias", "direction_asymmetry"),

@@ -15,7 +15,7 @@ import numpy as np
 
 from frictid_hil.blind.plant import TICK_S, Controller, Physics
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.experiments import FULL, Envelope, Experiment, chosen
+from frictid_hil.plan.experiments import FULL, Envelope, Experiment, chosen
 
 TOLERANCE = 0.008
 PAIRS = 8

@@ -22,7 +22,7 @@ from frictid_hil.blind.figures import lagging, low_pass, rms, slip_of_spring
 from frictid_hil.blind.joints import Joint, Payload, either_sign, log_uniform, told_body, told_experiments
 from frictid_hil.blind.plant import Controller, Physics
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.experiments import FULL, SHORT, Envelope, chosen
+from frictid_hil.plan.experiments import FULL, SHORT, Envelope, chosen
 
 KINDS = ("none",) * 4 + ("tolerance",) * 4 + ("single",) * 7 + ("double",) * 2 + ("outside",) * 3  # out of 20 cases
 NOTHING, PRESENT, WITHHELD = 0.2, 0.5, 1.5

@@ -18,11 +18,11 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import STIFFNESS
 from frictid_hil.gap.diagnosis import NextExperiment
 from frictid_hil.gap.experiment_set import Experiment, Nominal
-from frictid_hil.gap.experiments import Envelope, catalogue, plan_document
 from frictid_hil.gap.findings import Sampled
 from frictid_hil.gap.posterior import Known
 from frictid_hil.gap.residuals import LowPass, Recording, nominal_torque, view_of
 from frictid_hil.gap.rigid_column import IN_COLUMN
+from frictid_hil.plan.experiments import Envelope, catalogue, plan_document
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import View
 

@@ -22,7 +22,11 @@ from frictid_hil.errors import FrictidError, InputFileError, PlanRefused, UsageE
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
-from frictid_hil.gap.experiments import (
+from frictid_hil.jobs.gap.belief import Belief, belief_of, read_back
+from frictid_hil.jobs.gap.logs import existing_set, write_set
+from frictid_hil.jobs.plans import APPROACH_RAD_S, care_notes, expected_of
+from frictid_hil.jobs.watch import Watcher
+from frictid_hil.plan.experiments import (
     FULL,
     SHORT,
     Envelope,
@@ -32,10 +36,6 @@ from frictid_hil.gap.experiments import (
     chosen,
     names_of_plan,
 )
-from frictid_hil.jobs.gap.belief import Belief, belief_of, read_back
-from frictid_hil.jobs.gap.logs import existing_set, write_set
-from frictid_hil.jobs.plans import APPROACH_RAD_S, care_notes, expected_of
-from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.limits import refuse_beyond_limits
 from frictid_hil.plan.plan import REHEARSAL, Expected, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
 from frictid_hil.plan.setup import JointSetup, RobotSetup

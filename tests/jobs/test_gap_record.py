@@ -17,7 +17,10 @@ from frictid_hil.config.search import find
 from frictid_hil.errors import FrictidError, Interrupted, UsageError
 from frictid_hil.gap.diagnosis import Diagnosis, Figures, NextExperiment
 from frictid_hil.gap.experiment_set import ExperimentSet
-from frictid_hil.gap.experiments import (
+from frictid_hil.jobs import gap_record
+from frictid_hil.jobs.gap_record import FIRST, GapRecordOptions, _next, record, record_until_decided
+from frictid_hil.jobs.watch import Silent
+from frictid_hil.plan.experiments import (
     FULL,
     SCHEMA,
     Envelope,
@@ -27,9 +30,6 @@ from frictid_hil.gap.experiments import (
     names_of_plan,
     plan_document,
 )
-from frictid_hil.jobs import gap_record
-from frictid_hil.jobs.gap_record import FIRST, GapRecordOptions, _next, record, record_until_decided
-from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import Plan
 from frictid_hil.runner.events import Event, PhaseStarted, Preflight
 

@@ -20,9 +20,9 @@ from frictid_hil.config.write import dump
 from frictid_hil.errors import ConfigError, InputFileError, UsageError
 from frictid_hil.files import made_folder, write_whole
 from frictid_hil.gap.experiment_set import ExperimentSet, experiment_set, read_log
-from frictid_hil.gap.experiments import Experiment
 from frictid_hil.gap.tolerances import stated_by
 from frictid_hil.jobs.gap.belief import Belief, measured_by
+from frictid_hil.plan.experiments import Experiment
 from frictid_hil.recording.csv import write_csv
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Samples
