@@ -12,8 +12,9 @@ import pytest
 from scipy import signal
 
 from frictid_hil.gap.diagnose import diagnose
-from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
+from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.smoothing import as_smoothed
+from frictid_hil.jobs.gap.draft import drafted
 
 
 @functools.cache
@@ -115,3 +116,9 @@ def test_pushes_in_a_smoothed_torque_are_no_noise() -> None:
 
 def test_a_healthy_joint_stays_healthy_when_its_torque_is_smoothed() -> None:
     assert diagnose(smoothed(made(), 8.0)).verdict == "none"
+
+
+def test_a_draft_from_smoothed_torques_has_the_joints_inertia() -> None:
+    draft = drafted(smoothed(replace(made(), nominal=Nominal()), 6.0))["draft"]
+    assert draft["numbers"]["inertia_kg_m2"]["value"] == pytest.approx(0.4, rel=0.15), "0.29 where the filter bends it"
+    assert any("was low-passed at about" in warning for warning in draft["warnings"])

@@ -1,8 +1,9 @@
 """A first ``nominal.yaml`` from recordings alone: least squares of the plainest joint, each number with its tolerance.
 
 ``torque = inertia*acc + gravity_cos*cos(q) + gravity_sin*sin(q) + bias + coulomb*s + viscous*v``, every column behind
-the same low-pass, s the slip spring of equation (20). Standard errors allow for residuals that hang together in time
-and for how far the halves of the recordings disagree.
+the same low-pass, below the edge of a script's where one has smoothed the torque; s is the slip spring of equation
+(20). Standard errors allow for residuals that hang together in time and for how far the halves of the recordings
+disagree.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from frictid_hil.errors import InputFileError
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
 from frictid_hil.gap.residuals import LowPass, slip_state, uniform
+from frictid_hil.gap.smoothing import as_smoothed
 
 SLIP_RAD = 2e-4  # travel in which the slip spring yields, and friction builds up, where nobody measured it
 SPEEDS = 8  # points of the drafted friction curve
@@ -29,13 +31,14 @@ LARGEST_TOLERANCE = 0.5
 
 def drafted(logs: ExperimentSet) -> dict[str, Any]:
     """``joint``, ``tolerance`` and ``draft`` of a first ``nominal.yaml`` (``InputFileError``: no log has a torque)."""
-    known = [log for log in logs.experiments if log.torque_nm is not None]
-    if not known:
+    if all(log.torque_nm is None for log in logs.experiments):
         raise InputFileError(
             "no log has a torque, so there is no friction to draft",
             where=logs.name,
             next_step="command and position alone are diagnosed without a nominal joint",
         )
+    logs, smoothed = as_smoothed(logs)
+    known = [log for log in logs.experiments if log.torque_nm is not None]
     tables = [_table(log) for log in known]
     rigid = all(log.rigid_body_torque_nm is not None for log in known)
     table = np.concatenate(tables)
@@ -47,7 +50,9 @@ def drafted(logs: ExperimentSet) -> dict[str, Any]:
     weights[fitted] = np.linalg.lstsq(columns[:, fitted], torque, rcond=None)[0]
     sigma = np.full(columns.shape[1], np.inf)
     sigma[fitted] = _standard_errors(tables, fitted, torque - columns @ weights)
-    return _document(weights, sigma, known, rigid, torque, columns)
+    document = _document(weights, sigma, known, rigid, torque, columns)
+    document["draft"]["warnings"] += [smoothed] if smoothed is not None else []
+    return document
 
 
 _NAMES = ("inertia_kg_m2", "gravity_cos_nm", "gravity_sin_nm", "bias_nm", "coulomb_nm", "viscous_nm_s_per_rad")
