@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -205,3 +206,20 @@ def test_true_numbers_are_asked_where_the_answer_names_just_what_is_there(
     sizes = {"stribeck": 3.0, "torque_bias": 0.1}
     truth = {"contributors": [{"name": name, "size_alone": size} for name, size in sizes.items()]}
     assert benchmark_named("gap_how_far")._just(truth, added) is just
+
+
+def test_a_level_is_taken_for_what_is_told_first(benchmark_named: Callable[[str], Any], tmp_path: Path) -> None:
+    level = benchmark_named("gap_level")
+    (tmp_path / "truth").mkdir()
+    for name, kind in (("case_000", "none"), ("case_001", "single")):
+        (tmp_path / "truth" / f"{name}.yaml").write_text(yaml.safe_dump({"case": name, "kind": kind}))
+    assert level.healthy(tmp_path) == [tmp_path / "cases" / "case_000"]
+
+    def answer(verdict: str, *causes: tuple[str, float]) -> SimpleNamespace:
+        return SimpleNamespace(verdict=verdict, causes=[SimpleNamespace(effect=n, confidence=c) for n, c in causes])
+
+    other = answer("explained", ("inertia_error", 0.7), ("friction_level_error", 0.6))
+    assert level.taken(other) and level.told_with(other, "friction_level_error") == 0.6
+    assert not level.taken(answer("explained", ("friction_level_error", 0.9)))
+    assert not level.taken(answer("explained", ("inertia_error", 0.4)))
+    assert not level.taken(answer("unknown", ("inertia_error", 0.9))) and not level.taken(answer("none"))
