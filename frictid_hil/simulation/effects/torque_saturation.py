@@ -13,6 +13,8 @@ from frictid_hil.simulation.drive_form import ActuationForm, DriveView
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
 HARD = 60.0  # exponent from which a knee is a corner
+NEAR = np.array([0.7, 0.75, 0.8, 0.85, 0.9, 0.93, 0.95, 0.965, 0.975, 0.985, 0.99, 0.995, 1.0, 1.01, 1.03, 1.05])
+"""Limits to try, over the highest torque reported: a flat top is told to the width of its noise."""
 LASTS_S = 0.01  # time for which a demand beyond the limit lasts at least where a flat top can be told
 
 
@@ -45,7 +47,7 @@ def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
     given = max(float(np.quantile(np.abs(v.torque_nm), 0.999)) for v in views)
     if not math.isfinite(limit) or given > 0.995 * asked:
         return np.empty(0)
-    return np.linspace(0.7, 1.05, 15) * given / limit
+    return NEAR * given / limit
 
 
 EFFECT = Effect(
