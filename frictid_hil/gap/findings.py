@@ -28,6 +28,8 @@ SIDED = 0.75
 """Share of the chance on the side that is told, below which an error of the belief may as well be the other way round:
 it is no cause that could be told."""
 SURE = 0.99  # most that is claimed: one world in a hundred is of a kind that nobody thought of
+PUT_OFF: Mapping[str, float] = {"cycles_per_motor_revolution": 0.0, "limit_share": 0.2}
+"""Part of what a form may be off by that moves a number: a line has its order, and a flat top is seen by itself."""
 UNTOLD = 0.8  # most that is claimed of a cause of which the recordings tell a size and no number
 
 
@@ -86,7 +88,7 @@ def sampled(posterior: Posterior) -> Sampled:
     made = (defaultdict[str, Array](lambda: np.zeros(len(draws))) for _ in range(5))
     sizes, signs, blurs, believed, tolerated = made
     expected = 1.0 / math.sqrt(_ways(posterior, gram))
-    sided = {term.effect for term in posterior.channel.nuisances if len(term.columns) == 1}
+    sided = {term.effect for term in posterior.channel.nuisances if len(term.columns) == 1 and not term.shape}
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
     squares = np.diag(gram)
     before: dict[tuple[tuple[int, ...], int], dict[str, tuple[float, float]]] = {}
@@ -166,8 +168,8 @@ def _net(inner: Array, forms: Array, beliefs: np.ndarray) -> tuple[Array, Array]
     ``inner`` holds the mean products of what the causes make; ``forms`` is how far each of the others may be off its
     form in the way that one moves, over its size, (p, p); ``beliefs`` are errors of one believed number each.
 
-    A pair that more than half cancels explains nothing. Of an error of the belief only that counts which the sum of
-    all of them has along it: a torque constant takes back what inertia, gravity and friction make that are off alike.
+    A pair that more than half cancels explains nothing. Of an error of the belief only that counts which the others do
+    not take back: a torque constant takes back what inertia, gravity and friction make that are off alike.
     A cause that moves as a larger one does is told from it by their forms alone, and no joint is quite as its formula.
     """
     if not inner.size:
@@ -177,13 +179,24 @@ def _net(inner: Array, forms: Array, beliefs: np.ndarray) -> tuple[Array, Array]
     pair = squares[:, None] + squares + 2.0 * inner
     cancels = pair < CANCELS * np.maximum(squares[:, None], squares)
     taken_back = np.where(cancels, inner, 0.0).sum(axis=1) / own
-    among = np.where(beliefs, (inner * beliefs).sum(axis=1) / own - own, 0.0)
-    taken_back = np.minimum(taken_back, among)
     net: Array = np.maximum(0.0, own + taken_back)
+    at = np.flatnonzero(beliefs)
+    net[at] = np.minimum(net[at], _not_taken_back(inner[np.ix_(at, at)]))
     alike = inner / (own[:, None] * own)
     lent = forms * own / np.sqrt(np.maximum(1.0 - alike**2, FORM**2))
     np.fill_diagonal(lent, 0.0)
     return net, np.max(lent, axis=1, initial=0.0)
+
+
+def _not_taken_back(inner: Array) -> Array:
+    """RMS of the part of each error that the sum of all errors still has, shape (p,); ``inner`` as above, of these.
+
+    Each error, seen along any of them: a torque constant makes friction, too, which no error of gravity takes back.
+    """
+    along = inner / np.sqrt(np.maximum(np.diag(inner), 1e-300))
+    stays = np.minimum(np.abs(along), np.maximum(0.0, np.sign(along) * along.sum(axis=0)))
+    most: Array = np.max(stays, axis=1, initial=0.0)
+    return most
 
 
 def findings(channels: Sequence[Sampled]) -> list[Finding]:
@@ -332,10 +345,11 @@ def numbers(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
 
 
 def _put_off(name: str, value: float, lent: float) -> float:
-    """A number as the form may have put it off: by a factor, an angle by as many radians, a line's order not at all."""
-    if name.endswith("cycles_per_motor_revolution"):
-        return value
-    return value + lent - 1.0 if name.endswith("phase_rad") else lent * value
+    """A number as the form may have put it off: by a factor, an angle by as many radians."""
+    if name.endswith("phase_rad"):
+        return value + lent - 1.0
+    part = next((part for end, part in PUT_OFF.items() if name.endswith(end)), 1.0)
+    return value * (1.0 + part * (lent - 1.0))
 
 
 def _lent(effect: str, channels: Sequence[Sampled]) -> Array:

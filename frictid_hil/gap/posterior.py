@@ -37,7 +37,7 @@ STRETCHES = 6  # parts of the recordings that are left out one by one, at least
 FORM = 0.1
 """One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
 EXACT_FORM = 0.02
-"""The same where a rigid link, or a factor of the whole torque, gives the form: links bend by a few hundredths."""
+"""The same where a rigid link, a factor of the whole torque or a constant gives the form: links bend by hundredths."""
 VISIBLE = 0.5
 """Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
 MOST_DOUBT = 3.0

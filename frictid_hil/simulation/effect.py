@@ -133,7 +133,8 @@ class Effect:
     demand: DemandForm | None = None  # how it shows in the controller's own demand, where it does
     # The number of a nominal joint that it is an error of, as ``tolerance:`` names it; empty for others.
     belief: str = ""
-    exact: bool = False  # a rigid link, or a factor of the torque, gives its form; others are near it to a tenth
+    # A rigid link, a factor of the torque or a constant gives its form; others are near theirs to a tenth.
+    exact: bool = False
     # What it makes of a command on its way to the position, where that alone may tell of it.
     tracking: TrackingForm | None = None
     parted: tuple[Parting, ...] = ()  # what tells it from effects that look like it

@@ -53,6 +53,16 @@ def test_traces_that_are_real_but_drown_in_noise_are_no_cause(seed: int) -> None
     assert found.improved_model() is None or not found.improved_model().effects
 
 
+@pytest.mark.slow
+def test_a_torque_constant_takes_nothing_back_from_presliding() -> None:
+    withheld = {
+        "torque_constant_error": {"error_share": -0.1},
+        "presliding_hysteresis": {"share": 0.07, "distance_rad": 0.003},
+    }
+    found = diagnose(gap_sets.make(withheld))
+    assert found.verdict == "explained" and [cause.effect for cause in found.causes] == list(withheld)
+
+
 # -- the tool's own figures -------------------------------------------------------------------------------------------
 
 

@@ -31,6 +31,7 @@ EFFECT = Effect(
         "torque (N m)",
         {"without": np.sign, "with": lambda velocity: np.sign(velocity) + p["bias_nm"]},
     ),
+    exact=True,
     parted=(
         Parting(
             "direction_asymmetry",
