@@ -97,6 +97,21 @@ def test_what_cannot_be_right_is_refused_with_its_reason(asymmetric: ExperimentS
     assert told.value.where
 
 
+def test_a_slow_log_whose_velocity_is_mostly_steps_is_not_refused(asymmetric: ExperimentSet) -> None:
+    def stepped(e: Experiment) -> Experiment:
+        assert e.velocity_rad_s is not None
+        if e.name != "triangle_slow":
+            return e
+        steps = np.where(np.arange(e.velocity_rad_s.size) % 97 == 0, 3.0, 0.0)
+        return replace(e, velocity_rad_s=0.1 * e.velocity_rad_s + steps)
+
+    changed = replace(asymmetric, experiments=tuple(stepped(e) for e in asymmetric.experiments))
+    assert checked(changed) is changed
+    dead = replace(asymmetric, experiments=(stepped(asymmetric.experiments[1]),))
+    with pytest.raises(InputFileError, match="times the derivative"):
+        checked(dead)
+
+
 @pytest.mark.slow
 def test_a_joint_that_rests_in_its_dead_band_is_not_refused() -> None:
     """Command and position alone, as a hobby arm tells them: it stays where it is while a small command travels."""
