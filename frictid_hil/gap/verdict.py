@@ -94,6 +94,7 @@ def verdict(
     # Where functions without a name describe it as well, the names tell the gap only if they close it, and not at all
     # where those functions make more of it.
     untold = _unnamed([c for c, _ in telling if c in loud]) and any(stays(gap, REMAINS) for _, gap in telling)
+    untold |= any(gap.before > SHOWS * gap.floor and _of_the_drive(c, named, channels) for c, gap in telling)
     unexplained = nothing or generic_wins or untold or any(_open(gap, negligible) for _, gap in telling)
     small = small and all(gap.anywhere <= HALF * negligible for gap in gaps)
     if unexplained and small and _nothing_beyond_tolerance(channels):
@@ -108,9 +109,16 @@ def verdict(
         named = tuple(f if expected(f, channels) else f.at_most(DOUBTED) for f in named)
     first = named[0]
     rivals = [f for f in named[1:] if f.effect in first.rivals or first.effect in f.rivals]
-    if first.leads < LEADS and rivals:
-        return Verdict("ambiguous", named)
-    return Verdict("explained", named)
+    return Verdict("ambiguous" if first.leads < LEADS and rivals else "explained", named)
+
+
+def _of_the_drive(channel: Sampled, named: Sequence[Finding], channels: Sequence[Sampled]) -> bool:
+    """Whether a drive surely does what has no name, and of what has one no more than a tolerance lets expect."""
+    if channel.posterior.channel.of_the_joint:
+        return False
+    own = [f for f in named if f.where == channel.posterior.channel.name]
+    unnamed = [any(e.startswith(FAMILY) for e in draw.model.effects) for draw in channel.draws]
+    return float(np.mean(unnamed)) >= CERTAIN and all(expected(f, channels) for f in own)
 
 
 def _nothing_beyond_tolerance(channels: Sequence[Sampled]) -> bool:

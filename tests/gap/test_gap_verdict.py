@@ -77,6 +77,20 @@ def test_what_stays_of_a_guessed_demand_is_left_to_the_closed_loop(judged: bool,
     assert said.word == word
 
 
+@pytest.mark.parametrize(("unnamed", "word"), [(1.0, "unknown"), (0.5, "explained")])
+def test_a_drive_that_does_what_has_no_name_is_not_told_as_an_error_within_its_tolerance(
+    unnamed: float, word: str
+) -> None:
+    """A dead zone of 1.9 floors was a `controller_gain_error` with 0.89."""
+    quiet = channel("plant", "torque_bias", 0.1, np.ones(DRAWS))
+    drive = channel("actuation", ERROR, 1.5, np.ones(DRAWS))
+    for k, draw in enumerate(drive.draws):
+        draw.model = SimpleNamespace(effects=frozenset(["family demand"] * (k < unnamed * DRAWS)))
+    gaps = [Closed("plant", 1.0, 1.0, 0.9, 1.1, floor=1.0), Closed("actuation", 1.9, 1.3, 1.2, 1.4, floor=1.0)]
+    told = Finding(ERROR, 0.9, 0.9, 1.5, 0.99, {}, (), "actuation")
+    assert verdict([told], [quiet, drive], gaps, NEGLIGIBLE, otherwise_quiet=False).word == word
+
+
 @pytest.mark.parametrize(
     ("still", "along_nm", "word"), [(True, 1.2, "none"), (False, 1.2, "explained"), (True, 1.5, "explained")]
 )
