@@ -84,8 +84,9 @@ def test_a_drive_that_does_what_has_no_name_is_not_told_as_an_error_within_its_t
     """A dead zone of 1.9 floors was a `controller_gain_error` with 0.89."""
     quiet = channel("plant", "torque_bias", 0.1, np.ones(DRAWS))
     drive = channel("actuation", ERROR, 1.5, np.ones(DRAWS))
-    for k, draw in enumerate(drive.draws):
-        draw.model = SimpleNamespace(effects=frozenset(["family demand"] * (k < unnamed * DRAWS)))
+    held = [frozenset(["family demand"] * (k < unnamed * DRAWS)) for k in range(DRAWS)]
+    draws: Any = [SimpleNamespace(model=SimpleNamespace(effects=e), values=np.array([1.5])) for e in held]
+    drive = replace(drive, draws=draws)
     gaps = [Closed("plant", 1.0, 1.0, 0.9, 1.1, floor=1.0), Closed("actuation", 1.9, 1.3, 1.2, 1.4, floor=1.0)]
     told = Finding(ERROR, 0.9, 0.9, 1.5, 0.99, {}, (), "actuation")
     assert verdict([told], [quiet, drive], gaps, NEGLIGIBLE, otherwise_quiet=False).word == word
