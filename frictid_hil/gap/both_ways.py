@@ -78,8 +78,7 @@ def _half(cause: Finding, fit: Fit, posterior: Posterior) -> Half:
         numbers[name] = Value(value, float(low), float(high))
     width = posterior.channel.logs[0].x.shape[1]
     every = [np.bincount(fit.at, values, width).astype(np.float64) for values in drawn]
-    alone = [np.bincount(fit.at[-own:], values[-own:], width).astype(np.float64) for values in drawn]
-    return Half(replace(cause, parameters=numbers), closed_with(posterior, every, alone))
+    return Half(replace(cause, parameters=numbers), closed_with(posterior, every))
 
 
 def both_ways(channel: Channel) -> dict[str, Fit]:

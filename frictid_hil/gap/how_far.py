@@ -33,12 +33,11 @@ class Closed:
 
     channel: str  # its name
     before: float  # RMS of the residual
-    after: float  # RMS with the named causes taken off, and what the tolerances of all other beliefs allow
-    low: float  # 95 % interval of ``improved``, for another recording of these motions or the causes' true numbers
+    after: float  # RMS with the named causes taken off
+    low: float  # 95 % interval of ``after``, for another recording of these motions or the causes' true numbers
     high: float
     floor: float  # RMS that noise alone leaves
     fitted: float = 0.0  # RMS of the residual on the identification logs
-    improved: float = math.nan  # RMS with the named causes alone taken off: what the improved joint leaves
     # (log, seconds) where something shows that no identification log holds; None where nothing does.
     appeared: tuple[str, float] | None = None
 
@@ -50,33 +49,26 @@ class Closed:
 
 def closed(channel: Sampled, names: Collection[str]) -> Closed:
     """The gap of one channel without the named causes, and with them and what tolerances allow."""
-    draws = _without_generic(channel, names)
-    named = {"", *names}  # when a log began, and the like, is no error of a belief
-    return closed_with(
-        channel.posterior,
-        [coefficients(channel, draw) for draw in draws],
-        [coefficients(channel, draw, named) for draw in draws],
-    )
+    return closed_with(channel.posterior, [coefficients(channel, draw) for draw in _without_generic(channel, names)])
 
 
-def closed_with(posterior: Posterior, every: Sequence[Array], named: Sequence[Array]) -> Closed:
-    """The same with draws of coefficients of all the columns, (m,) each: of all that is fitted, of causes alone."""
+def closed_with(posterior: Posterior, every: Sequence[Array]) -> Closed:
+    """The same with draws of coefficients of all the columns, (m,) each."""
     judged = posterior.channel.judged
     constant = posterior.channel.level_free
     mean = np.mean(every, axis=0)
     nothing = np.zeros_like(mean)
-    left = _left(judged, np.mean(named, axis=0), constant)
-    apart = [_left(judged, theta, constant) - left for theta in named]
-    improved, half = rms(left), _half_width(left, apart, posterior.channel.step_s)
+    left = _left(judged, mean, constant)
+    apart = [_left(judged, theta, constant) - left for theta in every]
+    after, half = rms(left), _half_width(left, apart, posterior.channel.step_s)
     return Closed(
         posterior.channel.name,
         rms(_left(judged, nothing, constant)),
-        rms(_left(judged, mean, constant)),
-        math.sqrt(max(0.0, improved**2 - half)),
-        math.sqrt(improved**2 + half),
+        after,
+        math.sqrt(max(0.0, after**2 - half)),
+        math.sqrt(after**2 + half),
         min(posterior.floor, COLOUR * posterior.channel.known_floor),
         rms(_left(posterior.channel.fitted, nothing, constant)),
-        improved,
         _appeared(posterior, mean),
     )
 
@@ -102,11 +94,10 @@ def _without_generic(channel: Sampled, names: Collection[str]) -> list[Draw]:
     return posterior.draws([posterior.model(causes)], FEW)
 
 
-def coefficients(channel: Sampled, draw: Draw, only: Collection[str] | None = None) -> Array:
-    """Of all columns of the channel's table in one draw, those of functions without a name 0; ``only`` of causes."""
+def coefficients(channel: Sampled, draw: Draw) -> Array:
+    """Of all columns of the channel's table in one draw, those of functions without a name 0."""
     posterior = channel.posterior
-    parts = posterior.contributions(draw)
-    told = [part for name, part in parts.items() if not name.startswith(FAMILY) and (only is None or name in only)]
+    told = [part for effect, part in posterior.contributions(draw).items() if not effect.startswith(FAMILY)]
     columns, values = joined(told) if told else (np.zeros(0, dtype=int), np.zeros(0))
     return np.bincount(columns, values, posterior.channel.logs[0].x.shape[1]).astype(np.float64)
 

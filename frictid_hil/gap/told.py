@@ -72,10 +72,10 @@ def _figures(
     if runs:
         forward |= {when: simulated(run) for when, run in runs.items()}
     elif tracking is not None:
-        forward = {"before": (None, tracking.before), "after": (None, tracking.improved)}
+        forward = {"before": (None, tracking.before), "after": (None, tracking.after)}
     if not applied:
         forward["after"] = forward["before"]
-    ends = (None, None) if inverse is None else (inverse.before, inverse.improved if applied else inverse.before)
+    ends = (None, None) if inverse is None else (inverse.before, inverse.after if applied else inverse.before)
     noise = None if actuation is None else min(actuation.floor, forward["before"][0] or math.inf)
     floor = None if inverse is None else min(inverse.floor, inverse.before)
     still = None if tracking is None else min(tracking.floor, tracking.before)
@@ -93,7 +93,7 @@ def _causes(said: Verdict, channels: Sequence[Sampled], gaps: Sequence[Closed]) 
     largest = max(gaps, key=lambda g: g.before / g.floor, default=None)
     share = 0.0
     if largest is not None and largest.before > largest.floor:
-        rest = max(0.0, largest.improved**2 - largest.floor**2)
+        rest = max(0.0, largest.after**2 - largest.floor**2)
         share = max(0.0, 1.0 - rest / (largest.before**2 - largest.floor**2))
     return tuple(
         Cause(
@@ -151,7 +151,7 @@ def _summary(name: str, said: Verdict, there: str, gaps: Sequence[Closed], reaso
         return f"{name}: {place}{effects}; {loop}."
     told = max(gaps, key=lambda gap: gap.before / gap.floor)
     return (
-        f"{name}: {place}{effects}; the gap of the {told.channel} falls from {told.before:.3g} to {told.improved:.3g} "
+        f"{name}: {place}{effects}; the gap of the {told.channel} falls from {told.before:.3g} to {told.after:.3g} "
         f"({told.low:.3g} to {told.high:.3g}; noise alone {told.floor:.3g}) on recordings not used for fitting"
         f"{', and the rest has no name' if 'rest' in reasons else ''}."
     )
