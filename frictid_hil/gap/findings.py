@@ -22,6 +22,7 @@ DRAWS = 400  # samples of each channel's posterior: a chance is known to 0.025
 ABSENT = 0.2
 """Size, over the floor, below which a cause is absent: it adds a fiftieth. Between the two it is neither."""
 ALIKE = 0.05  # chance of another cause in the place of one from which the two are called confusable
+WHOLE = "torque_constant"  # belief whose error scales the whole torque
 EVEN = 0.5  # chance below which a cause is likelier not there
 EITHER = 0.25  # chance that an error shows one way or the other from which it is a rival of what is told
 SIDED = 0.75
@@ -98,7 +99,8 @@ def sampled(posterior: Posterior) -> Sampled:
         # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
         named = {**causes, **({"": parts[""]} if "" in parts else {})}
         inner = _products(list(named.values()), gram)
-        told = _net(inner, _forms(list(named)), np.array([name in sided for name in named]))
+        wholes = np.array([name in all_effects() and all_effects()[name].belief == WHOLE for name in named])
+        told = _net(inner, _forms(list(named)), np.array([name in sided for name in named]), wholes)
         for effect, net, blur in zip(causes, *told, strict=False):
             sizes[effect][k] = net / posterior.floor
             signs[effect][k] = np.sign(np.sum(causes[effect][1])) if effect in sided else 1.0
@@ -162,11 +164,12 @@ def _forms(names: Sequence[str]) -> Array:
     return np.where(lines[:, None] & ~lines, np.minimum(forms, EXACT_FORM), forms)
 
 
-def _net(inner: Array, forms: Array, beliefs: np.ndarray) -> tuple[Array, Array]:
+def _net(inner: Array, forms: Array, beliefs: np.ndarray, wholes: np.ndarray) -> tuple[Array, Array]:
     """(RMS of what each cause makes less what others take back, one-sigma of what their forms may have put on it).
 
     ``inner`` holds the mean products of what the causes make; ``forms`` is how far each of the others may be off its
-    form in the way that one moves, over its size, (p, p); ``beliefs`` are errors of one believed number each.
+    form in the way that one moves, over its size, (p, p); ``beliefs`` are errors of one believed number each, and
+    ``wholes`` those of them that scale the whole torque.
 
     A pair that more than half cancels explains nothing. Of an error of the belief only that counts which the others do
     not take back: a torque constant takes back what inertia, gravity and friction make that are off alike.
@@ -181,21 +184,22 @@ def _net(inner: Array, forms: Array, beliefs: np.ndarray) -> tuple[Array, Array]
     taken_back = np.where(cancels, inner, 0.0).sum(axis=1) / own
     net: Array = np.maximum(0.0, own + taken_back)
     at = np.flatnonzero(beliefs)
-    net[at] = np.minimum(net[at], _not_taken_back(inner[np.ix_(at, at)]))
+    net[at] = np.minimum(net[at], _not_taken_back(inner[np.ix_(at, at)], wholes[at]))
     alike = inner / (own[:, None] * own)
     lent = forms * own / np.sqrt(np.maximum(1.0 - alike**2, FORM**2))
     np.fill_diagonal(lent, 0.0)
     return net, np.max(lent, axis=1, initial=0.0)
 
 
-def _not_taken_back(inner: Array) -> Array:
-    """RMS of the part of each error that the sum of all errors still has, shape (p,); ``inner`` as above, of these.
+def _not_taken_back(inner: Array, wholes: np.ndarray) -> Array:
+    """RMS of the part of each error that the sum of all errors still has, shape (p,); both as above, of these.
 
-    Each error, seen along any of them: a torque constant makes friction, too, which no error of gravity takes back.
+    What scales the whole torque is seen along any of them: it makes friction, too, which no error of gravity takes
+    back.
     """
     along = inner / np.sqrt(np.maximum(np.diag(inner), 1e-300))
     stays = np.minimum(np.abs(along), np.maximum(0.0, np.sign(along) * along.sum(axis=0)))
-    most: Array = np.max(stays, axis=1, initial=0.0)
+    most: Array = np.where(wholes, np.max(stays, axis=1, initial=0.0), np.diag(stays))
     return most
 
 

@@ -9,9 +9,10 @@ from frictid_hil.gap.findings import _forms, _net
 
 
 def net(parts: list[list[float]], beliefs: list[bool]) -> np.ndarray:
-    """RMS that counts of each part, (n,), where parts are what causes make at some moments."""
+    """RMS that counts of each part, (n,), where parts are what causes make at some moments; the first scales all."""
     made = np.array(parts)
-    sizes, _ = _net(made @ made.T / made.shape[1], np.full(len(parts), 0.1), np.array(beliefs))
+    wholes = np.arange(len(parts)) == 0
+    sizes, _ = _net(made @ made.T / made.shape[1], np.full(len(parts), 0.1), np.array(beliefs), wholes)
     return sizes
 
 
