@@ -34,7 +34,7 @@ class Closed:
     channel: str  # its name
     before: float  # RMS of the residual
     after: float  # RMS with the named causes taken off
-    low: float  # 95 % interval of ``after``, for another recording of these motions or the causes' true numbers
+    low: float  # 95 % interval of ``after``, for another recording of these motions
     high: float
     floor: float  # RMS that noise alone leaves
     fitted: float = 0.0  # RMS of the residual on the identification logs

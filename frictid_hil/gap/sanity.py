@@ -26,6 +26,7 @@ OTHER_UNIT = 20.0
 LATEST_COMMAND_S = 0.5  # longest time by which a joint may follow its command late
 FOLLOWS = 0.5  # correlation of a position with its command from which on it follows
 LAGS = 51  # times that are tried
+SLOW = 0.2  # speed of a log over that of the fastest, below which its velocity may be mostly steps
 PROPORTIONAL = 0.5  # correlation of a velocity with the position's derivative from which on their ratio is clear
 ONE_WAY = 0.03  # part of its way that a joint must go back to move in both directions
 LONGEST_HALT = 0.25  # part of a log in which a position may repeat itself far from its command
@@ -112,10 +113,11 @@ def _check_velocity(experiments: ExperimentSet) -> None:
         if e.velocity_rad_s is not None:
             low_pass = LowPass.at(1.0 / e.step_s)
             true, told = np.gradient(low_pass(e.position_rad), e.time_s), low_pass(e.velocity_rad_s)
-            sums[e.name] = np.array([true @ told, true @ true, told @ told])
+            sums[e.name] = np.array([true @ told, true @ true, told @ told]) / true.size
     if not sums:
         return
-    clear = {name: s for name, s in sums.items() if abs(s[0]) > PROPORTIONAL * math.sqrt(s[1] * s[2])}
+    fast = SLOW**2 * max(s[1] for s in sums.values())
+    clear = {n: s for n, s in sums.items() if s[1] > fast or abs(s[0]) > PROPORTIONAL * math.sqrt(s[1] * s[2])}
     for name, (product, square, _) in {**clear, experiments.name: np.sum([*sums.values()], axis=0)}.items():
         slope = float(product) / max(float(square), 1e-300)
         if not 0.4 < slope < 2.5:

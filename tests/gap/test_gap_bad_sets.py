@@ -110,6 +110,12 @@ def test_a_slow_log_whose_velocity_is_mostly_steps_is_not_refused(asymmetric: Ex
     dead = replace(asymmetric, experiments=(stepped(asymmetric.experiments[1]),))
     with pytest.raises(InputFileError, match="times the derivative"):
         checked(dead)
+    first, *others = asymmetric.experiments
+    assert first.velocity_rad_s is not None
+    foreign = replace(first, velocity_rad_s=np.sin(np.arange(first.velocity_rad_s.size)))  # as of another joint
+    with pytest.raises(InputFileError, match="times the derivative") as told:
+        checked(replace(asymmetric, experiments=(foreign, *others)))
+    assert told.value.where == first.name
 
 
 @pytest.mark.slow
