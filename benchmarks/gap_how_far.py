@@ -5,8 +5,9 @@
 
 Every ``explained`` answer with a figure is looked at twice. *Again*: the validation motions are recorded once more with
 other noise; what the same causes leave of them has to lie in the interval, where they are still the answer. *True
-numbers*: the joint is drawn without the causes that are named and recorded; its gap to the old belief has to lie in the
-interval, too. That is asked where the answer names all that shows and nothing else.
+numbers*: the joint is drawn without the causes that are named and without the errors that were fitted beside them, and
+recorded; its gap to the old belief has to lie in the interval, too. That is asked where the answer names all that shows
+and nothing else.
 """
 
 from __future__ import annotations
@@ -68,7 +69,8 @@ def looked_at(folder: Path, seed: int, answer: Plain) -> dict[str, Any]:
     causes = answer["diagnosis"]["causes"]
     added = {cause["effect"] for cause in causes if cause["confidence"] >= EVEN}
     told = ExperimentSet.load(folder / "cases" / name)
-    asked = [(), added] if _just(truth, added) else [()]
+    improved = added | answer["diagnosis"]["fitted_along"].keys()
+    asked = [(), improved] if _just(truth, added) else [()]
     drawn = recorded_again(int(name.removeprefix("case_")), seed, truth["kind"], *asked)
     again, *bare = [_set(folder / "cases" / name, rows) for rows in drawn]
     return {

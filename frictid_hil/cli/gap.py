@@ -173,6 +173,9 @@ def _show_diagnosis(output: Output, result: Result) -> None:
     output.out.print(result["summary"], style="bold")
     if causes := [_cause(cause) for cause in result["causes"]]:
         output.table(("cause", "confidence", "closes", "parameters", "confusable with"), causes, ("cause", "closes"))
+    if along := result["fitted_along"]:
+        told = "; ".join(f"{effect} {_numbers(values)}" for effect, values in along.items())
+        output.out.print(f"fitted beside them, within tolerances: {told}")
     shares = [(region, region["share_of_gap"]) for region in result["where"]]
     where = [(r["region"], f"{100 * s:.0f} %", "█" * round(30 * s), r["description"]) for r, s in shares if s >= 0.005]
     output.table(("where", "share of gap", "", ""), where, ("where",))
@@ -208,13 +211,22 @@ def _print_gap(output: Output, gap: Result) -> None:
         )
 
 
-def _cause(cause: Result) -> tuple[str, ...]:
-    parameters = ", ".join(
+def _numbers(values: Result) -> str:
+    return ", ".join(
         f"{name} = {value['value']:.4g}" if isinstance(value, dict) else f"{name} = {value:.4g}"
-        for name, value in cause["parameters"].items()
+        for name, value in values.items()
     )
+
+
+def _cause(cause: Result) -> tuple[str, ...]:
     closed = "" if cause["gap_closed_percent"] is None else f"{cause['gap_closed_percent']:.0f} %"
-    return cause["effect"], f"{cause['confidence']:.2f}", closed, parameters, ", ".join(cause["confusable_with"])
+    return (
+        cause["effect"],
+        f"{cause['confidence']:.2f}",
+        closed,
+        _numbers(cause["parameters"]),
+        ", ".join(cause["confusable_with"]),
+    )
 
 
 @verb(app, "diagnose", _show_diagnosis, schema="gap_diagnose")

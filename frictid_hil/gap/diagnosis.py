@@ -94,9 +94,12 @@ class Diagnosis:
     # Why a figure is None, or what could not be concluded, by subject.
     reasons: Mapping[str, str] = field(default_factory=dict)
     summary: str = ""  # one sentence
-    model: JointModel | None = None  # the joint with its causes added, where the closed loop can be simulated
+    # The joint with its causes and ``fitted_along`` added, where the closed loop can be simulated.
+    model: JointModel | None = None
     # The joint with the likeliest causes added, whatever the verdict; for who asks for it all the same.
     candidate: JointModel | None = None
+    # Errors of the belief within its tolerances that were fitted beside the causes, by effect; part of ``model``.
+    fitted_along: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
     # By effect, change of the held-out squares when it alone is added, percent.
     held_out: Mapping[str, float] = field(default_factory=dict)
     raw: Raw | None = None  # the gap before any filter; None where it is not formed
@@ -106,9 +109,9 @@ class Diagnosis:
     presliding_nm_per_rad: float | None = None
 
     def improved_model(self) -> JointModel | None:
-        """The joint with the named causes added; the nominal joint where nothing is applied; None without a controller.
+        """The joint with the named causes and ``fitted_along`` added; None without a controller.
 
-        Nothing is applied when the verdict is ``unknown`` or ``ambiguous``.
+        Nothing is applied when the verdict is ``unknown`` or ``ambiguous``: it is the nominal joint.
         """
         return self.model
 
@@ -124,15 +127,13 @@ class Diagnosis:
                 {
                     "effect": c.effect,
                     "confidence": c.confidence,
-                    "parameters": {
-                        n: {"value": v.value, "interval_95": None if v.low is None else [v.low, v.high]}
-                        for n, v in c.parameters.items()
-                    },
+                    "parameters": _numbers(c.parameters),
                     "confusable_with": list(c.confusable_with),
                     "gap_closed_percent": c.gap_closed_percent,
                 }
                 for c in self.causes
             ],
+            "fitted_along": {effect: _numbers(values) for effect, values in self.fitted_along.items()},
             "where": [asdict(place) for place in self.where],
             "gap": {
                 "before": _figures(self.before),
@@ -153,6 +154,13 @@ class Diagnosis:
             "held_out_change_percent": dict(self.held_out),
             "reasons": dict(self.reasons),
         }
+
+
+def _numbers(values: Mapping[str, Value]) -> dict[str, Any]:
+    return {
+        name: {"value": v.value, "interval_95": None if v.low is None else [v.low, v.high]}
+        for name, v in values.items()
+    }
 
 
 def _figures(figures: Figures) -> dict[str, float | None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,10 +12,12 @@ from scipy import special
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, Rows
+from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Sampled
 from frictid_hil.gap.forward import Replayed, pooled
-from frictid_hil.gap.posterior import Draw, Posterior, joined
+from frictid_hil.gap.posterior import Draw, Posterior, by_term, joined
 from frictid_hil.gap.residuals import rms
+from frictid_hil.simulation.effects import all_effects
 
 COLOUR = 2.0
 """Noise at most, over what is white in it or comes from the position: a slow part three times as strong in power."""
@@ -92,6 +94,24 @@ def _without_generic(channel: Sampled, names: Collection[str]) -> list[Draw]:
     terms = Counter(draw.model.terms for draw in channel.draws).most_common(1)[0][0]
     causes = tuple(t for t in terms if posterior.channel.candidates[t].effect in names)
     return posterior.draws([posterior.model(causes)], FEW)
+
+
+def fitted_along(channel: Sampled, names: Collection[str]) -> dict[str, dict[str, Value]]:
+    """Errors of the belief that were fitted beside the named causes, within their tolerances: numbers by effect."""
+    if not channel.posterior.channel.of_the_joint:
+        return {}
+    posterior, made = channel.posterior, defaultdict[str, list[dict[str, float]]](list)
+    for draw in _without_generic(channel, names):
+        for term, values in by_term(posterior.terms(draw.model)[: len(posterior.channel.nuisances)], draw.values):
+            form = all_effects()[term.effect].inverse if term.effect else None
+            if form is not None and not term.shape and term.effect not in names:
+                made[term.effect].append(form.parameters({}, values))
+    return {effect: {name: _value([one[name] for one in each]) for name in each[0]} for effect, each in made.items()}
+
+
+def _value(drawn: Sequence[float]) -> Value:
+    low, middle, high = np.quantile(drawn, [0.025, 0.5, 0.975])
+    return Value(float(middle), float(low), float(high))
 
 
 def coefficients(channel: Sampled, draw: Draw) -> Array:

@@ -9,7 +9,7 @@ from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment,
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import EVEN, Sampled, either_way, told_numbers, whole_draws
 from frictid_hil.gap.forward import Replayed, why_not
-from frictid_hil.gap.how_far import Closed, held_out, simulated
+from frictid_hil.gap.how_far import Closed, fitted_along, held_out, simulated
 from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.prepared import Prepared, judged_role
 from frictid_hil.gap.residuals import Recording
@@ -28,11 +28,15 @@ def told(
     effects = told_numbers(f for f in said.named if f.confidence >= EVEN)
     bare, replay = (None, None) if simulation is None else (simulation.bare, simulation.replay)
     applied = said.word == "explained"
+    along = fitted_along(channels[0], effects) if applied and effects and channels else {}
+    improved = {**{effect: {n: v.value for n, v in along[effect].items()} for effect in along}, **effects}
+    if simulation is not None and simulation.fitted_gap_nm(improved) > simulation.fitted_gap_nm(effects):
+        along, improved = {}, effects  # the closed loop is the last judge
     runs: dict[str, Mapping[str, Replayed]] = {}
     if replay is not None and bare is not None:
         runs = {"before": bare, "after": bare}
         if applied and effects:
-            runs["after"] = replay(effects, validation=judged_role(logs))
+            runs["after"] = replay(improved, validation=judged_role(logs))
     before, after, floor = _figures(gaps, runs, applied)
     gain = experiments.nominal.controller.kd_nm_s_per_rad if experiments.nominal.controller is not None else None
     places = where(logs, floor.inverse_nm or 0.0, velocity_gain_nm_s_per_rad=gain)
@@ -54,8 +58,9 @@ def told(
         next_experiment=_next(said, experiments.nominal, logs, channels),
         reasons=reasons,
         summary=_summary(experiments.name, said, lives(places), gaps, reasons),
-        model=replay.model(effects if applied else {}) if replay is not None else None,
-        candidate=replay.model(effects) if replay is not None else None,
+        model=replay.model(improved if applied else {}) if replay is not None else None,
+        candidate=replay.model(improved) if replay is not None else None,
+        fitted_along=along,
         held_out=held_out(plant) if plant is not None else {},
         samples=whole_draws(effects, channels) if effects and channels else (),
         presliding_nm_per_rad=experiments.nominal.presliding_stiffness_nm_per_rad,

@@ -27,7 +27,16 @@ from frictid_hil.jobs.gap.export_mujoco import export_mujoco
 from frictid_hil.jobs.gap.exports import Wanted, Withheld, check_targets, figures_of_model, rows_of, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.logs import Source
-from frictid_hil.jobs.gap.write_model import Export, applied, exports, left_out_words, likely, natives, nearer_only
+from frictid_hil.jobs.gap.write_model import (
+    Export,
+    applied,
+    beside,
+    exports,
+    left_out_words,
+    likely,
+    natives,
+    nearer_only,
+)
 from frictid_hil.jobs.gap.write_model import write_model as write_changed
 from frictid_hil.jobs.identification.executors import answers, executor
 from frictid_hil.report.arm import arm_page
@@ -132,7 +141,7 @@ def _improved(experiments: ExperimentSet, found: Diagnosis, apply: bool) -> dict
     model = _chosen(found, apply)
     if model is not None:
         return _robot(experiments, model)
-    return _belief(experiments, applied(found, apply=apply))
+    return _belief(experiments, {**beside(found), **applied(found, apply=apply)})
 
 
 def _why_no_model(found: Diagnosis, apply: bool) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures
+from frictid_hil.gap.diagnosis import Diagnosis, Figures, Value
 from frictid_hil.gap.profiles import Profile
 from frictid_hil.gap.where import by_region
 from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, Figure, band, bars, line
@@ -39,7 +39,7 @@ def gap_page(found: Diagnosis, side_by_side: tuple[SideBySide, ...] = (), profil
         Section(
             "Which effect causes it",
             words=() if found.causes else ("No effect of the library is named.",),
-            tables=(_causes(found.causes),) if found.causes else (),
+            tables=(_causes(found),) if found.causes else (),
         ),
         Section("How far it closes", tables=(_how_far(found),), figures=_per_log(found.per_log)),
     ]
@@ -84,19 +84,29 @@ def _profile(profile: Profile) -> Figure:
     return Figure(profile.title, tuple(traces), profile.x_title, profile.y_title, profile.caption)
 
 
-def _causes(causes: tuple[Cause, ...]) -> Table:
+def _parameters(told: Mapping[str, Value]) -> list[str]:
+    return [
+        f"{name} = {value.value:.4g}"
+        + ("" if value.low is None or value.high is None else f" ({value.low:.4g} .. {value.high:.4g})")
+        for name, value in told.items()
+    ]
+
+
+def _causes(found: Diagnosis) -> Table:
     rows = []
-    for cause in causes:
-        parameters = [
-            f"{name} = {value.value:.4g}"
-            + ("" if value.low is None or value.high is None else f" ({value.low:.4g} .. {value.high:.4g})")
-            for name, value in cause.parameters.items()
-        ]
+    for cause in found.causes:
+        parameters = _parameters(cause.parameters)
         closed = format_figure(cause.gap_closed_percent, ".0f", "%")
         alike = ", ".join(cause.confusable_with)
         rows.append((cause.effect, f"{cause.confidence:.2f}", closed, "; ".join(parameters), alike))
     headings = ("effect", "confidence", "closes of the gap", "parameters (95 % interval)", "confusable with")
-    return Table(headings, tuple(rows))
+    return Table(headings, tuple(rows), caption=_along(found.fitted_along))
+
+
+def _along(fitted: Mapping[str, Mapping[str, Value]]) -> str:
+    """What was fitted within tolerances, in words; "" where nothing was."""
+    told = ", ".join(f"{effect} {parameter}" for effect, own in fitted.items() for parameter in _parameters(own))
+    return told and f"Fitted beside them, within the belief's tolerances, and in the improved joint, too: {told}."
 
 
 def _how_far(found: Diagnosis) -> Table:

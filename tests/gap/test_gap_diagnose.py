@@ -216,7 +216,8 @@ def test_improved_model_closes_the_gap_in_the_simulator() -> None:
     d = diagnose(experiments)
     model = d.improved_model()
     assert model is not None
-    assert set(model.effects) == {"direction_asymmetry"}
+    assert set(model.effects) == {"direction_asymmetry", *d.fitted_along}
+    assert all(value.low < value.value < value.high for own in d.fitted_along.values() for value in own.values())
     left = pooled(Replay(experiments)(model.effects, validation=True), "torque_nm")
     assert left == pytest.approx(d.after.forward_torque_nm, rel=1e-6)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from frictid_hil.gap.diagnose import diagnose
-from frictid_hil.gap.forward import Replayed, pooled
+from frictid_hil.gap.forward import Replay, Replayed, pooled
 from frictid_hil.gap.how_far import _half_width
 
 STEP_S = 0.02
@@ -45,6 +45,23 @@ def test_without_a_library_the_gap_is_told_all_the_same() -> None:
     found = diagnose(gap_sets.make({"torque_bias": {"bias_nm": 0.3}}), library=())
     assert found.before.inverse_nm == pytest.approx(0.3, rel=0.02)
     assert "torque_bias" not in {cause.effect for cause in found.causes}
+
+
+@pytest.mark.slow
+def test_what_was_fitted_within_tolerances_is_reported_and_in_the_improved_joint() -> None:
+    cause = {"direction_asymmetry": {"coulomb_share": 0.07, "viscous_share": 0.15}}
+    experiments = gap_sets.make({**cause, "friction_level_error": {"error_share": 0.004}})
+    found = diagnose(experiments)
+    level = found.fitted_along["friction_level_error"]["error_share"]
+    assert {c.effect for c in found.causes} == {"direction_asymmetry"}
+    assert level.low is not None and level.high is not None and level.low <= 0.004 <= level.high
+    told = found.to_json()["fitted_along"]["friction_level_error"]["error_share"]
+    assert told == {"value": level.value, "interval_95": [level.low, level.high]}
+    model = found.improved_model()
+    assert model is not None and model.effects["friction_level_error"]["error_share"] == level.value
+    alone = {name: model.effects[name] for name in cause}
+    left = pooled(Replay(experiments)(alone, validation=True), "torque_nm")
+    assert found.after.forward_torque_nm is not None and found.after.forward_torque_nm < 0.9 * left
 
 
 def test_a_closed_loop_is_told_from_where_a_log_has_settled() -> None:

@@ -112,6 +112,12 @@ def applied(found: Diagnosis, *, apply: bool) -> dict[str, dict[str, float]]:
     return effects
 
 
+def beside(found: Diagnosis) -> dict[str, dict[str, float]]:
+    """Errors of the belief that were fitted beside the causes, within their effects' bounds."""
+    told = found.fitted_along.items()
+    return {effect: within(effect, {n: v.value for n, v in values.items()}) for effect, values in told}
+
+
 def likely(found: Diagnosis) -> Sequence[Cause]:
     """The causes at an even chance or better, or the first: the size of the others is hardly more than a guess."""
     return [cause for cause in found.causes if cause.confidence >= EVEN] or found.causes[:1]
