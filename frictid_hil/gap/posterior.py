@@ -177,9 +177,8 @@ class Posterior:
             log_density = -rows * (math.log(deviation) + 0.5 * math.log(2.0 * math.pi)) - 0.5 * float(gram[-1, -1])
             self._left.append(fitted)
             for care in CARE:
-                scaled = gram.copy()
-                scaled[:nuisances] *= care
-                scaled[:, :nuisances] *= care
+                each = np.append(self._cared(care), np.ones(terms + 1 - nuisances))
+                scaled = gram * each[:, None] * each
                 final, more = integrated(scaled, np.arange(nuisances), np.arange(nuisances, terms + 1))
                 base.append(log_density + more)
                 grams.append(final[:-1, :-1])
@@ -410,8 +409,13 @@ class Posterior:
         own = [self._own[len(self.channel.nuisances) + t] for t in model.terms]
         at = np.concatenate([np.arange(self._first), *own]).astype(int)
         care = np.ones(at.size)
-        care[: self._first] = self.settings[g].care
+        care[: self._first] = self._cared(self.settings[g].care)
         return at, care
+
+    def _cared(self, care: float) -> Array:
+        """What multiplies each column of the nuisances, (k,): nobody's care tells when in a row a torque was taken."""
+        each = [np.full(len(t.columns), care if t.effect else 1.0) for t in self.channel.nuisances]
+        return np.concatenate([np.zeros(0), *each])
 
     def _centred(self, model: Model) -> Array:
         """Scaled means of a model's coefficients, nuisances first, before anything is recorded."""
@@ -483,7 +487,7 @@ class Posterior:
         result: dict[str, tuple[float, float]] = {}
         for k, term in enumerate(self.terms(draw.model)):
             tolerated = k < len(self.channel.nuisances)
-            expected = term.mean**2 + ((care if tolerated else 1.0) * term.deviation) ** 2
+            expected = term.mean**2 + ((care if tolerated and term.effect else 1.0) * term.deviation) ** 2
             made = float(expected @ squares[np.array(term.columns, dtype=int)])
             within, whole = result.get(term.effect, (0.0, 0.0))
             result[term.effect] = within + made * tolerated, whole + made
