@@ -118,6 +118,8 @@ class ControllerFile(Open):
     velocity_feedforward: NotNegative = 0.0  # share of the command's velocity, ``cascade``
     velocity_filter_s: NotNegative | None = None  # time constant of the low-pass on the velocity that it uses
     torque_limit_nm: Positive | None = None  # of its demand
+    # that it uses: of the moment, or the difference of its last two positions; unless stated the recordings tell
+    velocity: Literal["now", "difference"] | None = None
     command_rate: Literal["central", "backward"] | None = None  # difference of the command that makes dcommand/dt
     feedforward: FeedForward | None = None  # what it adds along its command
 

@@ -58,6 +58,8 @@ class Controller:
     command_rate: str = "central"
     command_rate_weight: float = 1.0  # c
     cascade: bool = False  # an inner loop has an integral
+    # The velocity that it uses: ``now``, or the ``difference`` of its last two positions. None: its recordings tell.
+    velocity: str | None = None
     feedforward: config.FeedForward | None = None  # None where there is none
 
     @property
@@ -275,6 +277,7 @@ def _controller(told: config.ControllerFile) -> Controller | None:
         velocity_filter_s=told.velocity_filter_s or 0.0,
         torque_limit_nm=told.torque_limit_nm or float("inf"),
         command_rate=told.command_rate or "central",
+        velocity=told.velocity,
         feedforward=told.feedforward,
     )
     if told.type == "pid" or told.kv is None:

@@ -18,6 +18,7 @@ from frictid_hil.gap.report_filter import as_meant
 from frictid_hil.gap.residuals import Recording, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.smoothing import as_smoothed
+from frictid_hil.gap.tick_timing import as_it_ticks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,9 +53,10 @@ class Prepared:
 def prepared(experiments: ExperimentSet, library: Collection[str]) -> Prepared:
     """The set made ready; ``library`` holds the effects that may be used."""
     experiments, smoothed = as_smoothed(checked(experiments))
-    experiments, reasons = completed(in_force(as_meant(experiments)))
+    experiments, tick = as_it_ticks(as_meant(experiments))
+    experiments, reasons = completed(in_force(experiments))
     experiments, form = as_it_yields(experiments)
-    told = {"band": smoothed, "presliding": form}
+    told = {"band": smoothed, "controller": tick, "presliding": form}
     reasons = {**reasons, **{name: why for name, why in told.items() if why is not None}}
     if (open_question := one_sided(experiments)) is not None:
         reasons["motion"] = open_question

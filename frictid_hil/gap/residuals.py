@@ -349,6 +349,8 @@ def controller_demand(
     position, command = between(position_rad, ticks), between(command_rad, ticks)
     tick_s = step_s / ticks
     differenced = np.diff(position, prepend=position[0]) / tick_s
+    if controller.velocity == "now":
+        differenced = np.gradient(position, tick_s)
     seen = differenced if velocity_rad_s is None else between(velocity_rad_s, ticks)
     velocity = lagged(lagged(seen, tick_s, velocity_lag_s), tick_s, controller.velocity_filter_s)
     if controller.command_rate == "backward":

@@ -172,6 +172,11 @@ def _robot(experiments: ExperimentSet, model: JointModel) -> dict[str, Any]:
     travel = min(_STANDARD_TRAVEL_RAD, 0.8 * (high - low))
     start = 0.5 * (low + high) - 0.5 * travel
     torque = model.drive.torque_limit_nm
+    if not math.isfinite(torque):
+        # No limit is stated: as far as it was seen to go, and a little further.
+        seen = [log.torque_nm for log in experiments.experiments if log.torque_nm is not None]
+        torque = 1.5 * max((float(np.abs(one).max()) for one in seen), default=model.drive.rated_torque_nm)
+        model = replace(model, drive=replace(model.drive, torque_limit_nm=torque))
     name = f"{experiments.name}-improved"
     return {
         "schema": "frictid.robot/1",

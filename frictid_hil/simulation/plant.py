@@ -25,7 +25,7 @@ INERTIA, MOTOR_SHARE, GRAVITY_COS, GRAVITY_SIN, GEAR_RATIO, COULOMB, STIFFNESS =
 PAYLOAD_INERTIA, PAYLOAD_GRAVITY_COS, ENCODER_STEP, ENCODER_ON_MOTOR = range(7, 11)
 KP, KI, KD, CONTROL_FILTER_S, REPORT_FILTER_S, TORQUE_LIMIT = range(11, 17)
 HAND_STIFFNESS, HAND_DAMPING, HAND_CENTRE, HAND_AMPLITUDE, HAND_FREQUENCY = range(17, 22)
-POWERED, BRAKED, CURVE_AT, CURVE_KNOTS, ARM_TORQUE, CASCADE, CORE_PARAMETERS = range(22, 29)
+POWERED, BRAKED, CURVE_AT, CURVE_KNOTS, ARM_TORQUE, CASCADE, VELOCITY_NOW, CORE_PARAMETERS = range(22, 30)
 
 # Slots of the state vector; effects' states follow.
 TIME, MOTOR_POSITION, MOTOR_VELOCITY, MOTOR_ACCELERATION, LINK_POSITION, LINK_VELOCITY, LINK_ACCELERATION = range(7)
@@ -390,6 +390,8 @@ def report(parameters: Vector, state: Vector, readings: Vector, tick: int, subst
     control_share = _filter_share(period_s, parameters[CONTROL_FILTER_S])
     report_share = _filter_share(period_s, parameters[REPORT_FILTER_S])
     controlled_rad_s = difference
+    if parameters[VELOCITY_NOW] != 0.0:
+        controlled_rad_s = state[MOTOR_VELOCITY] if parameters[ENCODER_ON_MOTOR] != 0.0 else state[LINK_VELOCITY]
     # effects at control_velocity transform controlled_rad_s
     state[CONTROL_VELOCITY] += control_share * (controlled_rad_s - state[CONTROL_VELOCITY])
     state[REPORT_VELOCITY] += report_share * (difference - state[REPORT_VELOCITY])

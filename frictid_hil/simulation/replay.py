@@ -17,6 +17,7 @@ from frictid_hil.simulation.compose import kernel, layout
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import JointModel
 
+SAGS = 3  # rounds that settle how far a joint sags where no integral holds it
 SUBSTEP_S = 1e-4  # longest sub-step of the physics
 CarryOver = Mapping[str, tuple[float, ...]]  # what the joint remembers of a recording (its warmth), by effect
 
@@ -26,8 +27,8 @@ class Controller:
     """A digital position controller: kp*(cmd - q) + integral(ki*(cmd - q)) + kd*(d cmd/dt - filtered v).
 
     A ``cascade`` integrates ki*kd/kp*(d cmd/dt - filtered v) as well: the error of its inner loop. The integral starts
-    at the static holding torque and is frozen while the limit is active; v is the backward difference of the measured
-    position behind a first-order filter.
+    at the static holding torque and is frozen while the limit is active; without one the joint starts where the law
+    holds it. v is the velocity, as ``velocity`` says, behind a first-order filter.
     """
 
     kp_nm_per_rad: float  # proportional gain
@@ -41,8 +42,15 @@ class Controller:
     command_rate: str = "central"
     command_rate_weight: float = 1.0  # share of d cmd/dt that enters; 0 in a cascade that damps the motion itself
     cascade: bool = False  # an inner loop with an integral; kp and kd are positive
+    # ``now``: as it is at the tick, as in many simulators; else the difference of the last two measured positions.
+    velocity: str | None = None
     # (command (n,), step in s) -> torque added along the command (n,); None adds none.
     added_nm: Callable[[Array, float], Array] | None = None
+
+    @property
+    def integrates(self) -> bool:
+        """Whether the law has an integral, which starts at the holding torque."""
+        return self.ki_nm_per_rad_s > 0.0 or self.kp_nm_per_rad == 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,17 +92,30 @@ def closed_loop(
     if controller.added_nm is not None:
         added = controller.added_nm(commands[:, plant.POSITION_COMMAND], period_s)
         # The integral starts at the holding torque; what the law adds at rest is already in it.
-        commands[:, plant.TORQUE_OFFSET] = added - added[0]
+        commands[:, plant.TORQUE_OFFSET] = added - added[0] * float(controller.integrates)
 
     parameters = packing.parameters(model, payload=payload)
     parameters[plant.KP] = controller.kp_nm_per_rad
     parameters[plant.KI] = controller.ki_nm_per_rad_s
     parameters[plant.KD] = controller.kd_nm_s_per_rad
     parameters[plant.CASCADE] = float(controller.cascade)
+    parameters[plant.VELOCITY_NOW] = float(controller.velocity == "now")
     parameters[plant.CONTROL_FILTER_S] = controller.velocity_filter_s
     parameters[plant.TORQUE_LIMIT] = min(controller.torque_limit_nm, model.drive.torque_limit_nm)
-    rows = _simulate(parameters, commands, period_s, plant.POSITION_MODE, float(command[0]), state, time, substep_s)
+    start_rad = float(command[0])
+    if not controller.integrates and controller.kp_nm_per_rad > 0.0:
+        start_rad = _held_at(parameters, start_rad, commands[0, plant.TORQUE_OFFSET])
+    rows = _simulate(parameters, commands, period_s, plant.POSITION_MODE, start_rad, state, time, substep_s)
     return rows if seed is None else _noisy(rows, model, seed)
+
+
+def _held_at(parameters: packing.Vector, command_rad: float, added_nm: float) -> float:
+    """Where a law without an integral holds the joint at rest, and friction nothing: it sags by what it has to hold."""
+    place, position_rad = kernel().place, command_rad
+    for _ in range(SAGS):
+        holding_nm = place(parameters, packing.state(), position_rad)
+        position_rad = command_rad - (holding_nm - added_nm) / parameters[plant.KP]
+    return position_rad
 
 
 def open_loop(
@@ -134,6 +155,8 @@ def _simulate(
     vector = packing.state()
     functions = kernel()
     holding_nm = functions.place(parameters, vector, float(start_rad))
+    if mode == plant.POSITION_MODE and parameters[plant.KI] == 0.0 and parameters[plant.KP] > 0.0:
+        vector[plant.INTEGRAL] = 0.0
     states = layout().states
     slots = {e.name: slice(states[e.name], states[e.name] + e.state_size) for e in all_effects().values() if e.carried}
     for name, slot in slots.items():
