@@ -94,10 +94,11 @@ def verdict(
     # Where functions without a name describe it as well, the names tell the gap only if they close it, and not at all
     # where those functions make more of it.
     untold = _unnamed([c for c, _ in telling if c in loud]) and any(stays(gap, REMAINS) for _, gap in telling)
-    untold |= any(gap.before > SHOWS * gap.floor and _of_the_drive(c, named, channels) for c, gap in telling)
-    unexplained = nothing or generic_wins or untold or any(_open(gap, negligible) for _, gap in telling)
+    drive = _of_the_drive(telling, named, channels)
+    only_drive = drive and quiet and all(expected(f, channels) for f in named)  # none by promise
+    unexplained = nothing or generic_wins or untold or drive or any(_open(gap, negligible) for _, gap in telling)
     small = small and all(gap.anywhere <= HALF * negligible for gap in gaps)
-    if unexplained and small and _nothing_beyond_tolerance(channels):
+    if only_drive or (unexplained and small and _nothing_beyond_tolerance(channels)):
         return Verdict("none", ())
     if unexplained:
         # A link that swings may be no help along the motion, and close the loop all the same.
@@ -112,9 +113,12 @@ def verdict(
     return Verdict("ambiguous" if first.leads < LEADS and rivals else "explained", named)
 
 
-def _of_the_drive(channel: Sampled, named: Sequence[Finding], channels: Sequence[Sampled]) -> bool:
-    """Whether a drive surely does what has no name, and of what has one no more than a tolerance lets expect."""
-    if channel.posterior.channel.of_the_joint:
+def _of_the_drive(
+    telling: Sequence[tuple[Sampled, Closed]], named: Sequence[Finding], channels: Sequence[Sampled]
+) -> bool:
+    """Whether most shows in the drive, which surely does what has no name, and else what a tolerance lets expect."""
+    channel, gap = max(telling, key=lambda one: one[1].before / one[1].floor)
+    if channel.posterior.channel.of_the_joint or gap.before <= SHOWS * gap.floor:
         return False
     own = [f for f in named if f.where == channel.posterior.channel.name]
     unnamed = [any(e.startswith(FAMILY) for e in draw.model.effects) for draw in channel.draws]
