@@ -184,6 +184,8 @@ def _show_diagnosis(output: Output, result: Result) -> None:
         output.out.print(f"record next ({asked['duration_s']:.0f} s): {asked['description']}")
     for subject, why in result["reasons"].items():
         output.out.print(f"{subject}: {why}")
+    if keys := result.get("not_read"):
+        output.out.print(f"nominal.yaml: nothing reads {', '.join(keys)}")
     if exported := result.get("mujoco"):
         output.say(f"mujoco: {exported['model']} and {exported['callback_script']}")
         for lost in exported["lost"]:

@@ -246,6 +246,13 @@ def load_nominal(path: Path, *, logs: bool = True) -> NominalSet:
     return NominalSet(file, document)
 
 
+def further_keys(file: NominalFile) -> tuple[str, ...]:
+    """Keys of joint, friction, payload, controller, drive and encoder that nothing reads, with their section."""
+    sections = {name: getattr(file, name) for name in ("joint", "payload", "controller", "drive", "encoder")}
+    sections["joint.friction"] = file.joint.friction
+    return tuple(f"{name}.{key}" for name, section in sections.items() if section for key in section.model_extra or {})
+
+
 def _misspelt(section: Any, path: KeyPath) -> Iterator[FieldProblem]:
     """Further keys that look like a known one which is missing."""
     if isinstance(section, tuple):

@@ -31,7 +31,8 @@ FILES: Mapping[str, tuple[str, type[BaseModel]]] = {
 _HEAD = """# Files
 
 Every file is YAML and names its kind by `schema:`, except `nominal.yaml`. A number is in the unit that ends its key:
-rad, rad/s, N m, s, m. An unknown key is an error that names the nearest known one, with file, line and column. Brackets
+rad, rad/s, N m, s, m. An unknown key is an error that names the nearest known one, with file, line and column; in
+`nominal.yaml` only where it looks like a known one, and `gap diagnose` lists the others as `not_read`. Brackets
 hold a key's type and what it is unless given; a key with neither that nor *required* may be left out.
 
 For completion in an editor, write the JSON schema of a kind and name it in the file's first line:

@@ -112,6 +112,7 @@ class Nominal:
     continuous: bool = False  # the joint may turn on and on
     tolerances: Tolerances = field(default_factory=Tolerances.of)  # one-sigma of every number
     document: Mapping[str, Any] | None = None  # the whole file, for writing an improved one
+    further_keys: tuple[str, ...] = ()  # of the file, that nothing reads
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,6 +262,7 @@ def _nominal(file: NominalFile, document: Mapping[str, Any], where: str) -> Nomi
         continuous=joint.continuous or joint.gear == "none",
         tolerances=Tolerances.of(file.tolerance),
         document=document,
+        further_keys=config.further_keys(file),
     )
 
 

@@ -76,6 +76,8 @@ def diagnose(
     result: dict[str, Any] = {"outcome": "ok", **found.to_json()}
     del result["schema"]  # the command line's own
     result["tolerances"] = list(experiments.nominal.tolerances.lines())
+    if experiments.nominal.further_keys:
+        result["not_read"] = list(experiments.nominal.further_keys)
     if experiments.at_rest:
         result["at_rest"] = list(experiments.at_rest)
     if write_model is not None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from frictid_hil.config.nominal import load_nominal
+from frictid_hil.config.nominal import further_keys, load_nominal
 from frictid_hil.errors import ConfigError
 
 PRACTICE = Path(
@@ -45,6 +45,9 @@ def test_values_and_further_keys_are_kept(tmp_path: Path) -> None:
     assert nominal.file.joint.friction is not None
     assert nominal.file.joint.friction.torque_nm == (3.0, 3.4)
     assert nominal.document.data["note"] == "anything a person wants to say"
+    assert further_keys(nominal.file) == ()
+    colour = load_nominal(written(tmp_path, TEXT.replace("  gear_ratio: 51", "  colour: red\n  gear_ratio: 51")))
+    assert further_keys(colour.file) == ("joint.colour",)
 
 
 @pytest.mark.parametrize(

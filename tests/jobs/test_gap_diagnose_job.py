@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,17 @@ def test_the_missing_effect_is_named_closed_and_written(asymmetric: Path, tmp_pa
     effects = improved.file.joints["0"].simulated["effects"]
     assert "direction_asymmetry" in effects
     assert Path(result["report"]).stat().st_size > 1_000_000, "the page carries its plots with it"
+
+
+@pytest.mark.slow
+def test_a_controller_without_a_stated_limit_gives_a_robot_that_loads(asymmetric: Path, tmp_path: Path) -> None:
+    free = shutil.copytree(asymmetric, tmp_path / "free")
+    text = (free / "nominal.yaml").read_text()
+    limit = next(line for line in text.splitlines() if "torque_limit_nm" in line)
+    (free / "nominal.yaml").write_text(text.replace(limit + "\n", ""))
+    assert diagnose(free, write_model=tmp_path / "improved.yaml")["verdict"] == "explained"
+    largest = max(np.abs(np.loadtxt(log, delimiter=",", skiprows=1)[:, 3]).max() for log in free.glob("*.csv"))
+    assert load_robot(tmp_path / "improved.yaml").file.joints["0"].max_torque_nm == pytest.approx(1.5 * largest)
 
 
 @pytest.mark.slow

@@ -188,6 +188,26 @@ def test_load_raises_friction_where_gravity_is_large() -> None:
     assert added[0] == pytest.approx(0.2 * GRAVITY + 0.01 * GRAVITY**2)
 
 
+def test_a_law_without_an_integral_sags_by_what_it_has_to_hold() -> None:
+    model, time = bare(), np.arange(1000) / 500
+    rows = closed_loop(model, Controller(5e3, 0.0, 80.0, 1000.0), time, np.zeros_like(time))
+    sag_rad = -GRAVITY / 5e3
+    assert rows.position_rad == pytest.approx(np.full(time.size, sag_rad), rel=1e-3)
+    assert rows.torque_nm == pytest.approx(np.full(time.size, -5e3 * sag_rad), rel=1e-3)
+
+
+def test_a_velocity_of_the_moment_is_half_a_tick_younger_than_a_difference() -> None:
+    time = np.arange(2000) / 500
+    command = 0.2 * (1 - np.cos(3 * time))
+    gains = (5e3, 1e4, 80.0, 500.0)
+    old, now = (closed_loop(bare(), Controller(*gains, velocity=velocity), time, command) for velocity in (None, "now"))
+    half_s = 0.5 / 500
+    # The loop that sees an old velocity runs ahead by what its gain makes of that: the acceleration, half a tick long.
+    ahead = 80.0 / 5e3 * half_s * np.gradient(old.velocity_rad_s, 1 / 500)
+    moving = slice(500, 1900)
+    assert np.corrcoef((old.position_rad - now.position_rad)[moving], ahead[moving])[0, 1] > 0.8
+
+
 def test_ripple_is_a_line_at_its_own_order() -> None:
     ripple = {"amplitude_nm": 0.8, "cycles_per_motor_revolution": 2.0, "phase_rad": 0.3}
     model = bare(effects={"torque_ripple": ripple}, **LEVEL)
