@@ -14,7 +14,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.joint import JointModel, ServoGains
-from frictid_hil.simulation.replay import Controller, closed_loop
+from frictid_hil.simulation.replay import Controller, closed_loop, holding_nm
 from frictid_hil.simulation.rigid_bodies import mujoco_library
 from frictid_hil.simulation.robot_model import Motor, RobotModel, actuators_on, inverse_torque, relax
 
@@ -66,6 +66,9 @@ def torque_difference(
     time = np.arange(time_s[0], time_s[-1], step_s)
     command = np.interp(time, time_s, command_rad)
     loop = _loop(robot.joint(joint).motor, model, step_s)
+    if not loop.integrates:  # both sides begin with what holds the joint
+        holding = holding_nm(model, float(command[0]))
+        loop = replace(loop, added_nm=lambda wanted, _: np.full(wanted.shape, holding))
     ours = closed_loop(model, loop, time, command).torque_nm[1:]
     theirs = _in_mujoco(robot, exported, joint, posture, command, loop, ours[0])[:-1]
     # A drive with another torque constant reports what it believes; MuJoCo tells what it gives.

@@ -109,6 +109,11 @@ def closed_loop(
     return rows if seed is None else _noisy(rows, model, seed)
 
 
+def holding_nm(model: JointModel, position_rad: float) -> float:
+    """The motor torque that holds a joint at rest, and friction nothing."""
+    return float(kernel().place(packing.parameters(model), packing.state(), position_rad))
+
+
 def _held_at(parameters: packing.Vector, command_rad: float, added_nm: float) -> float:
     """Where a law without an integral holds the joint at rest, and friction nothing: it sags by what it has to hold."""
     place, position_rad = kernel().place, command_rad
