@@ -19,7 +19,7 @@ from frictid_hil.gap.findings import EVEN, Finding, numbers, told_numbers
 from frictid_hil.gap.forward import Simulation, pooled
 from frictid_hil.gap.how_far import Closed
 from frictid_hil.gap.prepared import Prepared, prepared
-from frictid_hil.gap.quiet import NEGLIGIBLE, negligible_nm, quiet_before_any_filter, quiet_in_the_loop
+from frictid_hil.gap.quiet import NEGLIGIBLE, below, negligible_nm, quiet_before_any_filter, quiet_in_the_loop
 from frictid_hil.gap.reading import (
     COARSE,
     Reading,
@@ -117,7 +117,7 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     """What is said of one reading."""
     channels, gaps, reasons = reading.channels, reading.gaps, dict(reading.reasons)
     nothing_nm = negligible_nm(joint.nominal, channels, negligible)
-    quiet = quiet_before_any_filter(reading.measured, negligible)
+    quiet = quiet_raw = quiet_before_any_filter(reading.measured, negligible)
     # Nothing tells how loud a smoothed torque's noise was: there only a gap that means nothing in practice is none.
     quiet = quiet and (not joint.smoothed or all(gap.anywhere <= nothing_nm for gap in gaps))
     small = quiet and (joint.simulation is None or pooled(joint.simulation.bare, "torque_nm") <= HALF * nothing_nm)
@@ -144,6 +144,9 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
         said, gaps = half
         reasons["rest"] = f"{HALF_OF_IT}; the rest has no name"
         reasons.pop("closed_loop", None)  # that was of causes which are named no more
+    asked = quiet_raw and negligible > NEGLIGIBLE
+    if said.word == "unknown" and asked and below(nothing_nm, gaps, joint.simulation):
+        said = Verdict("none", ())  # somebody has said that it means nothing
     said = _cautious(said, reasons, any(r.experiment.validation for r in joint.logs))
     gaps = gaps if reading.along is None else [*gaps, *gaps_left([reading.along], said.named)]
     return told(joint, channels, gaps, said, reasons)

@@ -42,6 +42,12 @@ def quiet_before_any_filter(channels: Sequence[Sampled], share: float) -> bool:
     return True
 
 
+def below(nothing_nm: float, gaps: Sequence[Closed], simulation: Simulation | None) -> bool:
+    """Whether all gaps are below what means nothing, that of the simulated closed loop, too."""
+    looped_nm = 0.0 if simulation is None else pooled(simulation.bare, "torque_nm")
+    return looped_nm <= nothing_nm and all(gap.anywhere <= nothing_nm for gap in gaps)
+
+
 def quiet_in_the_loop(
     simulation: Simulation,
     found: Sequence[Finding],

@@ -37,8 +37,13 @@ def test_a_torque_gain_that_droops_is_no_wrong_torque_constant() -> None:
         top = float(np.max(np.abs(e.torque_nm)))
         return replace(e, torque_nm=e.torque_nm * (1.0 + 0.1 * np.abs(e.torque_nm) / top))
 
-    found = diagnose(replace(made, experiments=tuple(drooping(e) for e in made.experiments)))
+    droops = replace(made, experiments=tuple(drooping(e) for e in made.experiments))
+    found = diagnose(droops)
     assert found.verdict == "unknown" and "torque" in found.reasons["cause"]
+    assert found.before.inverse_nm is not None and gap_sets.NOMINAL.curve is not None
+    share = found.before.inverse_nm / gap_sets.NOMINAL.curve.coulomb_nm
+    assert diagnose(droops, negligible=0.5 * share).verdict == "unknown"
+    assert diagnose(droops, negligible=5.0 * share).verdict == "none", "somebody has said that it means nothing"
 
 
 @pytest.mark.slow
