@@ -165,6 +165,8 @@ class Encoder(Open):
     velocity_filter_s: NotNegative | None = None  # time constant of the low-pass on the reported velocity
 
 
+REMARKS = ("law", "integral_starts_at", "note", "comment", "description", "side", "name")
+"""Further keys of any section in which people and our own writers tell something that nothing reads."""
 ABSOLUTE_ONLY = ("zero_offset_rad", "torque_delay_s", "current_lag_s", "velocity_filter_s")
 """Numbers whose usual value is 0, so that a share of them says nothing."""
 
@@ -247,10 +249,14 @@ def load_nominal(path: Path, *, logs: bool = True) -> NominalSet:
 
 
 def further_keys(file: NominalFile) -> tuple[str, ...]:
-    """Keys of joint, friction, payload, controller, drive and encoder that nothing reads, with their section."""
+    """Keys of joint, friction, payload, controller, drive and encoder that nothing reads, with their section.
+
+    Remarks are for people.
+    """
     sections = {name: getattr(file, name) for name in ("joint", "payload", "controller", "drive", "encoder")}
     sections["joint.friction"] = file.joint.friction
-    return tuple(f"{name}.{key}" for name, section in sections.items() if section for key in section.model_extra or {})
+    told = {name: section.model_extra or {} for name, section in sections.items() if section}
+    return tuple(f"{name}.{key}" for name, extra in told.items() for key in extra if key not in REMARKS)
 
 
 def _misspelt(section: Any, path: KeyPath) -> Iterator[FieldProblem]:
