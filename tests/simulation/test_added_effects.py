@@ -110,6 +110,16 @@ def test_lines_of_a_cogging_motor_are_found_up_to_what_the_sampling_sees() -> No
     assert 72.0 not in torque_ripple.lines_seen([_spinning(torque[slow], angle[slow], 0.025)])
 
 
+def test_a_line_is_found_by_a_joint_that_turns_a_quarter() -> None:
+    time_s = 0.001 * np.arange(12000)
+    angle = 0.45 * np.sin(0.8 * time_s) + 0.3 * np.sin(2.6 * time_s)
+    noise = 0.05 * np.random.default_rng(3).standard_normal(time_s.size)
+    ripple = 0.3 * np.cos(18 * angle + 0.4)
+    assert np.ptp(angle) < 0.25 * 2.0 * np.pi
+    assert torque_ripple.lines_seen([_spinning(ripple + noise, angle, 0.001)])[:1] == (18.0,)
+    assert torque_ripple.lines_seen([_spinning(noise, angle, 0.001)]) == ()
+
+
 def test_the_lines_found_give_amplitude_and_phase_back() -> None:
     time_s = 0.001 * np.arange(6000)
     angle = 6.3 * time_s

@@ -73,17 +73,18 @@ def lines_seen(views: Sequence[View]) -> tuple[float, ...]:
 
     A line is in reach where the motor turns by less than half its period from sample to sample, and where the recording
     covers two of its periods. The floor of a line is the median power of its neighbours, which the friction of a joint
-    that moves to and fro raises too.
+    that moves to and fro raises too. On less than a revolution, a line is as wide as one over the part that was turned.
     """
     parts = [(v.gear_ratio * v.position_rad, _unexplained(v), _step_rad(v)) for v in views]
     angle, rest, step = (np.concatenate([part[k] for part in parts]) for k in range(3))
     turns = float(np.ptp(angle)) / (2.0 * np.pi)
     moving = step > 0.0
-    if turns < 1.0 or not moving.any():
+    if not turns > 0.0 or not moving.any():
         return ()
+    width = max(1, math.ceil(1.0 / turns))
     highest = int(min(MOST_CYCLES, 0.8 * np.pi / max(float(np.median(step[moving])), 1e-9)))
     orders = np.arange(max(1, math.ceil(2.0 / turns)), highest + 1)
-    if orders.size < 2 * NEIGHBOURS:
+    if orders.size < 2 * NEIGHBOURS * width:
         return ()
     thin = max(1, angle.size // MOST_ROWS)
     angle, rest, step = angle[::thin], rest[::thin], step[::thin]
@@ -93,10 +94,16 @@ def lines_seen(views: Sequence[View]) -> tuple[float, ...]:
         known = order * step < np.pi
         power[k] = abs((rest * known) @ turned / known.sum()) ** 2 * np.sqrt(known.mean())
         turned *= once
-    near = [power[max(0, k - NEIGHBOURS) : k + NEIGHBOURS + 1] for k in range(orders.size)]
+    near = [
+        power[k % width :: width][max(0, k // width - NEIGHBOURS) : k // width + NEIGHBOURS + 1]
+        for k in range(orders.size)
+    ]
     ratio = power / np.maximum([np.median(part) for part in near], 1e-300)
-    best = [k for k in np.argsort(-power) if ratio[k] > STANDS_OUT][: len(PREFIXES)]
-    return tuple(float(orders[k]) for k in best)
+    best: list[int] = []
+    for k in (int(one) for one in np.argsort(-power) if ratio[one] > STANDS_OUT):
+        if all(abs(k - other) >= width for other in best):
+            best.append(k)
+    return tuple(float(orders[k]) for k in best[: len(PREFIXES)])
 
 
 def _unexplained(v: View) -> Array:
