@@ -35,7 +35,7 @@ class Closed:
 
     channel: str  # its name
     before: float  # RMS of the residual
-    after: float  # RMS with the named causes taken off
+    after: float  # RMS with the named causes taken off, and what the tolerances of other beliefs allow
     low: float  # 95 % interval of ``after``, for another recording of these motions
     high: float
     floor: float  # RMS that noise alone leaves

@@ -413,7 +413,10 @@ class Posterior:
         return at, care
 
     def _cared(self, care: float) -> Array:
-        """What multiplies each column of the nuisances, (k,): nobody's care tells when in a row a torque was taken."""
+        """What multiplies each column of the nuisances, (k,): a maker's care is of the numbers that he has named.
+
+        It does not tell when in a row a torque was taken, nor how friction builds up.
+        """
         each = [np.full(len(t.columns), care if t.effect else 1.0) for t in self.channel.nuisances]
         return np.concatenate([np.zeros(0), *each])
 

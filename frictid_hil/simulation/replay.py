@@ -102,10 +102,12 @@ def closed_loop(
     parameters[plant.VELOCITY_NOW] = float(controller.velocity == "now")
     parameters[plant.CONTROL_FILTER_S] = controller.velocity_filter_s
     parameters[plant.TORQUE_LIMIT] = min(controller.torque_limit_nm, model.drive.torque_limit_nm)
-    start_rad = float(command[0])
-    if not controller.integrates and controller.kp_nm_per_rad > 0.0:
+    start_rad, integrates = float(command[0]), controller.integrates
+    if not integrates:
         start_rad = _held_at(parameters, start_rad, commands[0, plant.TORQUE_OFFSET])
-    rows = _simulate(parameters, commands, period_s, plant.POSITION_MODE, start_rad, state, time, substep_s)
+    rows = _simulate(
+        parameters, commands, period_s, plant.POSITION_MODE, start_rad, state, time, substep_s, integrates=integrates
+    )
     return rows if seed is None else _noisy(rows, model, seed)
 
 
@@ -156,11 +158,13 @@ def _simulate(
     carried: CarryOver | None,
     time: Array,
     substep_s: float | None = None,
+    *,
+    integrates: bool = True,  # the law holds the joint by an integral from the start
 ) -> Simulated:
     vector = packing.state()
     functions = kernel()
     holding_nm = functions.place(parameters, vector, float(start_rad))
-    if mode == plant.POSITION_MODE and parameters[plant.KI] == 0.0 and parameters[plant.KP] > 0.0:
+    if not integrates:
         vector[plant.INTEGRAL] = 0.0
     states = layout().states
     slots = {e.name: slice(states[e.name], states[e.name] + e.state_size) for e in all_effects().values() if e.carried}
