@@ -123,7 +123,8 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     small = quiet and (joint.simulation is None or pooled(joint.simulation.bare, "torque_nm") <= HALF * nothing_nm)
     if quiet and joint.simulation is not None:
         quiet = quiet_in_the_loop(joint.simulation, reading.found, channels, gaps, nothing_nm, guessed=joint.guessed)
-    still = joint.guessed and _still(joint.simulation, gaps)
+    loop = joint.simulation if joint.guessed else None
+    still = loop is not None and pooled(loop.bare, "torque_nm") <= SHOWS * _noise_nm(loop, gaps)
     said = verdict(reading.found, channels, gaps, nothing_nm, quiet, joint.simulation is not None, still, small)
     if reading.sought:
         # A link that the closed loop tells is for the closed loop to judge.
@@ -149,7 +150,7 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
         said = Verdict("none", ())  # somebody has said that it means nothing
     said = _cautious(said, reasons, any(r.experiment.validation for r in joint.logs))
     gaps = gaps if reading.along is None else [*gaps, *gaps_left([reading.along], said.named)]
-    return told(joint, channels, gaps, said, reasons)
+    return told(joint, reading, gaps, said, reasons)
 
 
 def _half_of_it(
@@ -214,11 +215,6 @@ def _ranked(
             sizes[f.effect] = max(sizes[f.effect], math.sqrt(f.chance) * made / noise_nm)
     refuted = borne.refuted if borne is not None else ()
     return replace(said, named=tuple(sorted(said.named, key=lambda f: (f.effect in refuted, -sizes[f.effect]))))
-
-
-def _still(simulation: Simulation | None, gaps: Sequence[Closed]) -> bool:
-    """Whether the closed loop shows no gap as large as its noise."""
-    return simulation is not None and pooled(simulation.bare, "torque_nm") <= SHOWS * _noise_nm(simulation, gaps)
 
 
 def _noise_nm(simulation: Simulation, gaps: Sequence[Closed]) -> float:

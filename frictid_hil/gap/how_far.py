@@ -24,6 +24,7 @@ COLOUR = 2.0
 FEW = 40  # draws from which the interval of a gap is read: its ends are known to a tenth of its width
 APPEARED = 2.5
 """Rest of a validation log over that of the fitted ones from which something is in it that was not there before."""
+FEWEST = 5  # parts of a short rest that tell how far it would repeat
 WINDOW_S = 1.0
 """Time over which a rest is averaged, to tell since when it is there, and how far it would repeat: twice the memory of
 the slow noise."""
@@ -49,9 +50,10 @@ class Closed:
         return max(self.before, self.fitted)
 
 
-def closed(channel: Sampled, names: Collection[str]) -> Closed:
-    """The gap of one channel without the named causes, and with them and what tolerances allow."""
-    return closed_with(channel.posterior, [coefficients(channel, draw) for draw in _without_generic(channel, names)])
+def closed(channel: Sampled, names: Collection[str], made: Collection[str] | None = None) -> Closed:
+    """The gap of one channel without the named causes, and with them and what tolerances allow, or what is ``made``."""
+    draws = _without_generic(channel, names)
+    return closed_with(channel.posterior, [coefficients(channel, draw, made) for draw in draws])
 
 
 def closed_with(posterior: Posterior, every: Sequence[Array]) -> Closed:
@@ -62,30 +64,33 @@ def closed_with(posterior: Posterior, every: Sequence[Array]) -> Closed:
     nothing = np.zeros_like(mean)
     left = _left(judged, mean, constant)
     apart = [_left(judged, theta, constant) - left for theta in every]
-    after, half = rms(left), _half_width(left, apart, posterior.channel.step_s)
+    after = rms(left)
+    low, high = _interval(left, apart, posterior.channel.step_s)
     return Closed(
         posterior.channel.name,
         rms(_left(judged, nothing, constant)),
         after,
-        math.sqrt(max(0.0, after**2 - half)),
-        math.sqrt(after**2 + half),
+        low,
+        high,
         min(posterior.floor, COLOUR * posterior.channel.known_floor),
         rms(_left(posterior.channel.fitted, nothing, constant)),
         _appeared(posterior, mean),
     )
 
 
-def _half_width(left: Array, apart: Sequence[Array], step_s: float) -> float:
-    """Of the 95 % interval of the mean square of what is ``left``, shape (n,).
+def _interval(left: Array, apart: Sequence[Array], step_s: float) -> tuple[float, float]:
+    """95 % interval of the RMS of what is ``left``, shape (n,).
 
     Draws are ``apart`` from it by as much as their mean may be off by itself. Another recording of these motions is as
-    far from what is expected as this one, and both are so by what their parts differ by.
+    far from what is expected as this one, and both are so by what their parts differ by. Where loud parts are rare,
+    this one may have none: upwards they differ in ratio.
     """
     numbers = float(np.quantile([np.mean(made**2) for made in apart], 0.95))
-    parts = np.array_split(left**2, max(2, round(left.size * step_s / WINDOW_S)))
-    means = [float(np.mean(part)) for part in parts]
-    repeats = float(special.stdtrit(len(means) - 1, 0.975)) * float(np.std(means, ddof=1)) * math.sqrt(2 / len(means))
-    return math.hypot(numbers, repeats)
+    parts = np.array_split(left**2, max(FEWEST, round(left.size * step_s / WINDOW_S)))
+    means, square = [float(np.mean(part)) for part in parts], rms(left) ** 2
+    apart_by = float(special.stdtrit(len(means) - 1, 0.975)) * float(np.std(means, ddof=1)) * math.sqrt(2 / len(means))
+    louder = square * math.expm1(apart_by / square) if square > 0.0 else 0.0
+    return math.sqrt(max(0.0, square - math.hypot(numbers, apart_by))), math.sqrt(square + math.hypot(numbers, louder))
 
 
 def _without_generic(channel: Sampled, names: Collection[str]) -> list[Draw]:
@@ -114,10 +119,10 @@ def _value(drawn: Sequence[float]) -> Value:
     return Value(float(middle), float(low), float(high))
 
 
-def coefficients(channel: Sampled, draw: Draw) -> Array:
-    """Of all columns of the channel's table in one draw, those of functions without a name 0."""
-    posterior = channel.posterior
-    told = [part for effect, part in posterior.contributions(draw).items() if not effect.startswith(FAMILY)]
+def coefficients(channel: Sampled, draw: Draw, made: Collection[str] | None = None) -> Array:
+    """Of all columns of the channel's table in one draw: 0 for functions without a name, and what is not ``made``."""
+    posterior, parts = channel.posterior, channel.posterior.contributions(draw)
+    told = [p for e, p in parts.items() if not e.startswith(FAMILY) and (made is None or e in made)]
     columns, values = joined(told) if told else (np.zeros(0, dtype=int), np.zeros(0))
     return np.bincount(columns, values, posterior.channel.logs[0].x.shape[1]).astype(np.float64)
 

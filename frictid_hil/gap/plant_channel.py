@@ -75,7 +75,8 @@ def plant_channel(
         noises = [max(pair, key=rms) for pair in zip(noises, folded, strict=True)]
     measured = [r.view for r in logs if r.view is not None]
     friction_nm = rms(np.concatenate([v.coulomb_nm * v.slip + v.rate_nm for v in views]))
-    scale = min(friction_nm / 3.0, _gap_nm(residuals, logs[0].low_pass))
+    gap_nm = rms(np.concatenate([logs[0].low_pass(residual)[5:-5] for residual in residuals]))
+    scale = min(friction_nm / 3.0, gap_nm)
     builder, known, candidates = terms_of(nominal, views, measured, logs, library, estimated, scale)
     low_pass = band(residuals, logs[0].low_pass, candidates if lines else (), builder.parts)
     rows = []
@@ -201,11 +202,6 @@ def heard(rows: Sequence[Rows], white_nm: float, coulomb_nm: float, step_s: floa
     local = [np.sqrt(np.convolve(log.known_noise**2, window, mode="same") + white_nm**2) for log in rows]
     most_nm = max(SWAMPED * float(np.median(np.concatenate(local))), UNTOLD * coulomb_nm)
     return [replace(log, told=size <= most_nm) for log, size in zip(rows, local, strict=True)]
-
-
-def _gap_nm(residuals: Sequence[Array], low_pass: LowPass) -> float:
-    """RMS of the residual behind the usual low-pass, N m."""
-    return rms(np.concatenate([low_pass(residual)[5:-5] for residual in residuals]))
 
 
 def without_nuisances(logs: Sequence[Rows], nuisances: Sequence[Term], candidates: Sequence[Term]) -> list[Rows]:

@@ -181,16 +181,14 @@ def _with_readings(
     for name, value in joint.kinematic.items():
         form = all_effects()[name].kinematic
         assert form is not None
-        size = (
-            gain * rms(np.concatenate(made)) / channels[0].posterior.floor if made and not form.position_step else 1.0
-        )
+        shows = made and not form.position_step
+        size = gain * rms(np.concatenate(made)) / channels[0].posterior.floor if shows else 1.0
         told = {form.parameter: Value(value, 0.95 * value, 1.05 * value)}
         others = [f for f in found if f.effect != name]
         if form.in_loop and joint.simulation is not None:
             there = {**beside, **told_numbers(f for f in others if f.chance >= EVEN)}
-            told[form.in_loop] = Value(
-                _loop_share(name, {form.parameter: value}, form.in_loop, there, joint.simulation)
-            )
+            acts = _loop_share(name, {form.parameter: value}, form.in_loop, there, joint.simulation)
+            told[form.in_loop] = Value(acts)
         found = [*others, Finding(name, READ, READ, max(size, 1.0), 0.0, told, (), READ_DIRECTLY)]
     return sorted(found, key=lambda f: -f.size)
 

@@ -37,7 +37,8 @@ def held_by_column(nominal: Nominal, views: Sequence[View], logs: Sequence[Recor
     loads = {r.experiment.payload for r in logs}
     if nominal.inertia_kg_m2 or len(loads) > 1 or any(r.experiment.rigid_body_torque_nm is None for r in logs):
         return None
-    own = [np.stack([*_filtered(v), *_over_angle(v), v.load_nm], axis=1) for v in views]
+    angles = [(np.cos(v.position_rad), np.sin(v.position_rad), np.ones_like(v.slip)) for v in views]
+    own = [np.stack([*_filtered(v), *angle, v.load_nm], axis=1) for v, angle in zip(views, angles, strict=True)]
     table = np.concatenate([_slow(part, v)[5:-5] for part, v in zip(own, views, strict=True)])
     acceleration, angle, column = table[:, 0], table[:, ANGLE], table[:, -1]
     apart = acceleration - angle @ np.linalg.lstsq(angle, acceleration, rcond=None)[0]
@@ -80,11 +81,6 @@ def _filtered(view: View) -> list[Array]:
     """The acceleration, as it is and behind low-passes: its maker may have used one, or a slope over several rows."""
     a, rate_hz = view.acceleration_rad_s2, 1.0 / view.step_s
     return [a, *(LowPass(rate_hz, min(hertz, 0.2 * rate_hz))(a) for hertz in FILTERS_HZ)]
-
-
-def _over_angle(view: View) -> tuple[Array, Array, Array]:
-    """Gravity over the joint's own angle, and a level, per N m."""
-    return np.cos(view.position_rad), np.sin(view.position_rad), np.ones_like(view.slip)
 
 
 def _slow(columns: Array, view: View) -> Array:

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from frictid_hil.errors import InputFileError
 from frictid_hil.friction.curve import FrictionCurve
@@ -42,7 +43,9 @@ def checked(experiments: ExperimentSet) -> ExperimentSet:
         _check(e, experiments.nominal)
     _check_velocity(experiments)
     signs = [s for e in experiments.experiments if (s := _torque_sign(e)) is not None]
-    swapped = bool(signs) and max(signs) < 0.0 and sum(_work_j(e) for e in experiments.experiments) < 0.0
+    # A joint gives back what its inertia and its height took, no more.
+    works = [trapezoid(e.torque_nm, e.position_rad) for e in experiments.experiments if e.torque_nm is not None]
+    swapped = bool(signs) and max(signs) < 0.0 and sum(works) < 0.0
     if swapped and not _one_way(experiments):  # where a bias may be larger than friction
         raise InputFileError(
             "torque and velocity have opposite signs: the joint seems to drive the motor all the time",
@@ -241,13 +244,6 @@ def _torque_sign(e: Experiment) -> float | None:
     columns = np.stack([np.sign(moved), np.cos(q), np.sin(q), effort], axis=1)
     weights = np.linalg.lstsq(columns, centred, rcond=None)[0]
     return float(weights[0]) / max(float(np.std(centred)), 1e-12)
-
-
-def _work_j(e: Experiment) -> float:
-    """Work of the reported torque along a log, J; a joint gives back what its inertia and its height took, no more."""
-    if e.torque_nm is None:
-        return 0.0
-    return float(np.sum(0.5 * (e.torque_nm[1:] + e.torque_nm[:-1]) * np.diff(e.position_rad)))
 
 
 def completed(experiments: ExperimentSet) -> tuple[ExperimentSet, dict[str, str]]:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import EVEN, Sampled, either_way, told_numbers, whole_draws
 from frictid_hil.gap.forward import Replayed, why_not
-from frictid_hil.gap.how_far import Closed, fitted_along, held_out, simulated
+from frictid_hil.gap.how_far import Closed, closed, fitted_along, held_out, simulated
 from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.prepared import Prepared, judged_role
+from frictid_hil.gap.reading import Reading
 from frictid_hil.gap.residuals import Recording
 from frictid_hil.gap.verdict import DOUBTED, TIED, Verdict
 from frictid_hil.gap.where import lives, where
@@ -22,10 +24,10 @@ them. Of such causes 73 of 104 were there in joints of the wide world, and hardl
 
 
 def told(
-    joint: Prepared, channels: Sequence[Sampled], gaps: Sequence[Closed], said: Verdict, reasons: dict[str, str]
+    joint: Prepared, reading: Reading, gaps: Sequence[Closed], said: Verdict, reasons: dict[str, str]
 ) -> Diagnosis:
     """The result as a value."""
-    experiments, logs, simulation = joint.experiments, joint.logs, joint.simulation
+    experiments, logs, simulation, channels = joint.experiments, joint.logs, joint.simulation, reading.channels
     if simulation is None:
         reasons["forward_torque_nm"] = why_not(experiments) or ""
         reasons.setdefault("forward_position_rad", reasons["forward_torque_nm"])
@@ -36,6 +38,8 @@ def told(
     improved = {**{effect: {n: v.value for n, v in along[effect].items()} for effect in along}, **effects}
     if simulation is not None and simulation.fitted_gap_nm(improved) > simulation.fitted_gap_nm(effects):
         along, improved = {}, effects  # the closed loop is the last judge
+    if applied and "rest" not in reasons:
+        gaps = [_improved(gap, reading, effects, improved) for gap in gaps]
     runs: dict[str, Mapping[str, Replayed]] = {}
     if replay is not None and bare is not None:
         runs = {"before": bare, "after": bare}
@@ -70,6 +74,15 @@ def told(
         presliding_nm_per_rad=experiments.nominal.presliding_stiffness_nm_per_rad,
         raw=None if plant is None else Raw(*plant.posterior.channel.raw, plant.posterior.channel.cutoff_hz),
     )
+
+
+def _improved(gap: Closed, reading: Reading, effects: Collection[str], improved: Collection[str]) -> Closed:
+    """With what the improved joint leaves: it has no number for tolerances without a name."""
+    channel = next(c for c in [*reading.measured, *reading.channels] if c.posterior.channel.name == gap.channel)
+    if not channel.posterior.channel.of_the_joint:
+        return gap
+    left = closed(channel, effects, improved)
+    return replace(gap, after=left.after, low=left.low, high=left.high)
 
 
 def _figures(
@@ -163,9 +176,9 @@ def _summary(name: str, said: Verdict, there: str, gaps: Sequence[Closed], reaso
         return f"{name}: {place}{effects}; these recordings cannot decide."
     if (loop := reasons.get("closed_loop")) is not None:
         return f"{name}: {place}{effects}; {loop}."
-    told = max(gaps, key=lambda gap: gap.before / gap.floor)
+    told, other = max(gaps, key=lambda gap: gap.before / gap.floor), "" if "gap" in reasons else " not used for fitting"
     return (
         f"{name}: {place}{effects}; the gap of the {told.channel} falls from {told.before:.3g} to {told.after:.3g} "
-        f"({told.low:.3g} to {told.high:.3g}; noise alone {told.floor:.3g}) on recordings not used for fitting"
+        f"({told.low:.3g} to {told.high:.3g}; noise alone {told.floor:.3g}) on recordings{other}"
         f"{', and the rest has no name' if 'rest' in reasons else ''}."
     )

@@ -18,7 +18,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Where
-from frictid_hil.gap.residuals import LowPass, Recording
+from frictid_hil.gap.residuals import LowPass, Recording, rms
 from frictid_hil.simulation.effect import Region
 from frictid_hil.simulation.inverse import View
 
@@ -78,8 +78,9 @@ def where(
         low_pass = recording.low_pass
         row_s = recording.step_s * low_pass.stride
         floor = noise_nm**2 * row_s
-        for region, residual in _of_drive(recording, low_pass, velocity_gain_nm_s_per_rad):
-            add(region, float(np.sum(low_pass.thinned(residual[:, None])[:, 0] ** 2 * row_s - floor)))
+        for region, beside_noise in _of_drive(recording, low_pass, velocity_gain_nm_s_per_rad):
+            squares, white = np.sum(low_pass.thinned(beside_noise) ** 2, axis=0) * row_s
+            add(region, float(squares - white))
         log, winding, still = _thinned(recording, low_pass, top)
         squares = log.residual_nm**2 * row_s
         add(Region.REVERSAL, float(np.sum(squares[winding] - floor)))
@@ -114,20 +115,29 @@ def lives(places: Sequence[Where]) -> str:
 
 
 def _of_drive(recording: Recording, low_pass: LowPass, velocity_gain: float | None) -> list[tuple[Region, Array]]:
-    """The residuals of drive and sensors as torques, unfiltered."""
+    """The residuals of drive and sensors as torques, unfiltered, each with white noise as loud as its own, (n, 2)."""
     view = recording.view
     assert view is not None
     parts = []
     if recording.actuation_nm is not None:
-        parts.append((Region.ACTUATION, recording.actuation_nm))
+        parts.append((Region.ACTUATION, _beside_noise(recording.actuation_nm, low_pass)))
     if recording.kinematic_rad_s is not None:
-        error = recording.kinematic_rad_s
-        if velocity_gain is not None:
-            parts.append((Region.KINEMATICS, velocity_gain * error))
-        else:
-            inertia = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2
-            parts.append((Region.KINEMATICS, inertia * np.gradient(low_pass(error), recording.step_s)))
+        # Nobody states for when in a row its velocity holds.
+        change = np.gradient(low_pass(view.velocity_rad_s), recording.step_s)
+        late_s, half_s = recording.kinematic_rad_s @ change / max(change @ change, 1e-300), 0.5 * recording.step_s
+        errors = _beside_noise(recording.kinematic_rad_s - np.clip(late_s, -half_s, half_s) * change, low_pass)
+        if velocity_gain is None:
+            errors = np.gradient(low_pass(errors), recording.step_s, axis=0)
+        weight = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2 if velocity_gain is None else velocity_gain
+        parts.append((Region.KINEMATICS, weight * errors))
     return parts
+
+
+def _beside_noise(residual: Array, low_pass: LowPass) -> Array:
+    """A residual and white noise as loud as it is in the octave above the band, (n, 2)."""
+    above = LowPass(low_pass.rate_hz, 2.0 * low_pass.cutoff_hz)(residual) - low_pass(residual)
+    white = np.random.default_rng(0).standard_normal(residual.size) * rms(above) / low_pass.white_gain
+    return np.stack([residual, white], axis=1)
 
 
 def _thinned(recording: Recording, low_pass: LowPass, top: float) -> tuple[_Log, np.ndarray, np.ndarray]:
@@ -147,7 +157,8 @@ def _thinned(recording: Recording, low_pass: LowPass, top: float) -> tuple[_Log,
 def _sliding(logs: Sequence[_Log], top: float, noise_nm: float) -> dict[tuple[Region, str], float]:
     """Squares of the sliding part by region, N2 m2 s."""
     end_s = max(log.view.start_s + log.recording.step_s * log.view.position_rad.size for log in logs)
-    warm_c = _mean_temperature_c(logs)
+    known_c = [c for log in logs if (c := log.recording.experiment.temperature_c) is not None and np.isfinite(c).any()]
+    warm_c = float(np.nanmean(np.concatenate(known_c))) if known_c else 0.0
     families = [_families(log, top, end_s, warm_c) for log in logs]
     names = list(families[0])
     weight = [math.sqrt(log.recording.step_s * log.stride) for log in logs]
@@ -216,11 +227,6 @@ def _families(log: _Log, top: float, end_s: float, warm_c: float) -> dict[Region
     return result
 
 
-def _mean_temperature_c(logs: Sequence[_Log]) -> float:
-    known = [c for log in logs if (c := log.recording.experiment.temperature_c) is not None and np.isfinite(c).any()]
-    return float(np.nanmean(np.concatenate(known))) if known else 0.0
-
-
 class _Explained:
     """Squares of a residual that families of columns describe, alone and together."""
 
@@ -281,13 +287,8 @@ def _after_reversal(position_rad: Array, slip: Array, travel_rad: float) -> np.n
     """True until the joint has moved ``travel_rad`` since its direction of sliding changed."""
     direction = np.where(np.abs(slip) >= 0.999, np.sign(slip), 0.0)
     path = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(position_rad)))])
-    since = np.full(path.size, np.inf)
-    last, start = 0.0, -np.inf
-    for k in range(path.size):
-        if direction[k] == 0.0:
-            start = path[k]
-        elif direction[k] != last:
-            start, last = path[k], direction[k]
-        since[k] = path[k] - start
-    mask: np.ndarray = since < travel_rad
+    slid = np.maximum.accumulate(np.where(direction != 0.0, np.arange(path.size), -1))[:-1]  # row that slid last
+    before = np.concatenate([[0.0], np.where(slid < 0, 0.0, direction[slid])])
+    start = np.where((direction == 0.0) | (direction != before), path, -np.inf)
+    mask: np.ndarray = path - np.maximum.accumulate(start) < travel_rad
     return mask

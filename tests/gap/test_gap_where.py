@@ -75,6 +75,18 @@ def test_what_has_one_clear_place_is_found_there(
     assert shares[effect].get(region, 0.0) >= least
 
 
+def test_a_noisy_velocity_of_a_row_s_middle_is_no_gap() -> None:
+    """A controller's gain makes much torque of half a row; what a joint does wrong is smaller, and comes first."""
+    made = gap_sets.make({"torque_bias": {"bias_nm": 0.1}}, seed=4)
+    random, logs = np.random.default_rng(5), []
+    for e in made.experiments:
+        middle = np.gradient(e.position_rad, gap_sets.STEP_S)
+        logs.append(replace(e, velocity_rad_s=middle + 0.01 * random.standard_normal(middle.size)))
+    noise_nm = gap_sets.NOISE_NM * LowPass.at(1.0 / gap_sets.STEP_S).white_gain
+    told = where(recordings(replace(made, experiments=tuple(logs))), noise_nm, velocity_gain_nm_s_per_rad=18.0)
+    assert by_region(told).get(Region.KINEMATICS, 0.0) < 0.1
+
+
 def test_friction_that_falls_with_a_measured_temperature_is_told_as_such() -> None:
     made = gap_sets.make()
     hot = []

@@ -8,7 +8,7 @@ import pytest
 
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.forward import Replay, Replayed, pooled
-from frictid_hil.gap.how_far import _half_width
+from frictid_hil.gap.how_far import _interval
 
 STEP_S = 0.02
 TRUE = np.array([0.4, 1.0])  # coefficients of what is left and of what a cause makes, N m
@@ -31,8 +31,7 @@ def test_the_interval_holds_another_recording_and_the_true_numbers_in_nine_of_te
         fitted = np.linalg.lstsq(cause, _recorded(random, x), rcond=None)[0]
         draws = fitted + random.standard_normal((40, 1)) * np.sqrt(covariance)
         left = _recorded(random, x) - cause @ fitted
-        half = _half_width(left, [cause @ (fitted - draw) for draw in draws], STEP_S)
-        low, high = np.sqrt(np.mean(left**2) - half), np.sqrt(np.mean(left**2) + half)
+        low, high = _interval(left, [cause @ (fitted - draw) for draw in draws], STEP_S)
         other = _recorded(random, x)
         again.append(low <= np.sqrt(np.mean((other - cause @ fitted) ** 2)) <= high)
         true.append(low <= np.sqrt(np.mean((other - cause @ TRUE[1:]) ** 2)) <= high)
