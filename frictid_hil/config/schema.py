@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
@@ -82,11 +82,13 @@ def validated(document: Document, model: type[Model], data: Mapping[str, Any] | 
     # A misspelt key is one mistake, though it is also a missing one.
     meant = {(*path[:-1], near) for path, near in unknown.items() if near}
     problems = [FieldProblem(path, _unknown(model, path, near)) for path, near in unknown.items()]
+    messages: dict[KeyPath, list[str]] = {}
     for error in errors:
         path = _existing(document, error["loc"])
         if error["type"] != "extra_forbidden" and not (error["type"] == "missing" and path in meant):
             message = _missing(document, model, path) if error["type"] == "missing" else _message(path, error)
-            problems.append(FieldProblem(path, message))
+            messages.setdefault(path, []).append(message)
+    problems += [FieldProblem(path, _either(each)) for path, each in messages.items()]
     raise document.error(problems, at_key=unknown)
 
 
@@ -115,10 +117,17 @@ def _message(path: KeyPath, error: ErrorDetails) -> str:
     return f"{message}, found {_shown(error['input'])}{_unit_hint(path, error['input'])}"
 
 
+def _either(messages: Sequence[str]) -> str:
+    """One message of all kinds of value that a field takes."""
+    wanted = [message.partition(", found ")[0].removeprefix("expected ") for message in messages]
+    _, found, value = messages[0].partition(", found ")
+    return f"expected {' or '.join(wanted)}{found}{value}" if found and len(messages) > 1 else "; ".join(messages)
+
+
 def _existing(document: Document, loc: tuple[int | str, ...]) -> KeyPath:
     """``loc`` without the words pydantic adds (names of validators and of union members)."""
-    _, found = document.deepest(loc)
-    return loc[: len(found) + 1]
+    node, found = document.deepest(loc)
+    return loc[: len(found) + isinstance(node.content, dict)]
 
 
 def _shown(value: Any) -> str:

@@ -262,7 +262,9 @@ class CsvTable:
                 )
             for k in at:
                 if not row[k].strip():
-                    return InputFileError(f"line {line}, column {self.names[k]}: blank", where=where)
+                    next_step = "remove the row, or fill the gap; nothing is interpolated silently"
+                    message = f"line {line}, column {self.names[k]}: blank"
+                    return InputFileError(message, where=where, next_step=next_step)
                 if not self._is_number(row[k]):
                     return InputFileError(
                         f"line {line}, column {self.names[k]}: {row[k][:40]!r} is not a number", where=where

@@ -159,6 +159,7 @@ def samples_of(
             f"{table.place(int(backwards[0]) + 1)}: time does not increase ({backwards.size} such rows)",
             where=str(table.path),
             cause="rows reordered, two recordings joined, or time written with too few digits",
+            next_step="sort the rows, give each recording a file, or write the time with more digits",
         )
     samples = checked(
         Samples(joint=joint, time_ns=time_ns, prismatic=prismatic, meta=meta, **columns),  # type: ignore[arg-type]

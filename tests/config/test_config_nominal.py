@@ -65,6 +65,12 @@ def test_values_and_further_keys_are_kept(tmp_path: Path) -> None:
         ("name: fast", "name: slow", ":13:10", "'slow' is also experiment 0"),
         ("name: fast, ", "", ":13:3", "name: missing"),
         ("joint:\n", "joints:\n", ":1:1", "missing"),
+        (
+            "joint:\n",
+            "tolerance: {torque_constant: 10%}\njoint:\n",
+            ":3:30",
+            "tolerance.torque_constant: expected a valid number or 'data_sheet', 'cad' or 'profile', found '10%'",
+        ),
     ],
 )
 def test_mistakes_are_told_with_their_place(tmp_path: Path, old: str, new: str, where: str, words: str) -> None:
