@@ -268,11 +268,18 @@ class SimulatedReplay:
         return path
 
 
+def _last_asked(time_s: Array, asked_rad: Array, cycle_s: float) -> Array:
+    """The set-point that was in force last before each row but the first, rad, shape (n - 1,)."""
+    between = np.interp(time_s[1:] - cycle_s, time_s, asked_rad)
+    return np.where(np.diff(time_s) > 1.5 * cycle_s, between, asked_rad[:-1])
+
+
 def simulate(robot: Robot, samples: Samples) -> SimulatedReplay:
     """Stream a recording's set-points to the robot file's ``simulated`` joint (``ConfigError``: a wrong mapping).
 
     It starts at rest, powered, where the recording does; set-point k is in force from t_k on, and rows follow the
-    timing of a live run (position at t_k, mean torque of what led to it).
+    timing of a live run (position at t_k, mean torque of what led to it). Where rows are further apart than cycles,
+    the set-points between them are interpolated: the joint had them, too.
     """
     from frictid_hil.simulation.joint import JointModel  # loads numba; a replay without simulation does not need it
     from frictid_hil.simulation.servo_loop import ServoLoop
@@ -282,13 +289,14 @@ def simulate(robot: Robot, samples: Samples) -> SimulatedReplay:
     quiet = replace(model, drive=replace(model.drive, torque_noise_per_mille=0.0))
     command = samples.position_command_rad
     note = "" if command is not None else "no set-points in the recording: the measured positions are followed"
-    targets = (samples.position_rad if command is None else command).tolist()
+    asked = samples.position_rad if command is None else command
+    targets = _last_asked(samples.time_s, asked, 1.0 / robot.file.cycle_hz).tolist()
     loop = ServoLoop(quiet, period_s=_CONTROL_PERIOD_S, position_rad=float(samples.position_rad[0]))
     loop.power(True)
     loop.brake(False)
     steps_s = (np.diff(samples.time_ns) * 1e-9).tolist()
     position, velocity, torque = [loop.measured_position_rad], [0.0], [0.0]
-    for step_s, target_rad in zip(steps_s, targets, strict=False):
+    for step_s, target_rad in zip(steps_s, targets, strict=True):
         loop.advance(step_s, position_rad=target_rad)
         position.append(loop.measured_position_rad)
         velocity.append(loop.velocity_rad_s)

@@ -23,9 +23,10 @@ from frictid_hil.errors import ConfigError, InputFileError, UsageError
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.bus_logs import lost_rows
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
-from frictid_hil.jobs.replay import ReplayOptions, replay
+from frictid_hil.jobs.replay import ReplayOptions, replay, simulate
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.recording.bus_log import BusLogWriter, LogBus, logged, read_frames
+from frictid_hil.recording.samples import Samples
 
 pytestmark = pytest.mark.slow
 
@@ -73,6 +74,18 @@ def test_set_points_on_the_simulated_joint_move_it_as_recorded(run: Path, robot:
     # What is left of the torque is the drive's noise: 5 per mille of rated.
     torque = later["simulated_torque_nm"] - later["torque_nm"]
     assert np.sqrt(np.mean(torque**2)) < 0.007 * load_robot(robot).file.joints["5"].rated_torque_nm
+
+
+def test_a_log_of_every_eighth_cycle_is_no_later_for_that(run: Path, robot: str, tmp_path: Path) -> None:
+    (csv,) = replay(ReplayOptions(run, robot, out=tmp_path))["simulated"]
+    rows = np.genfromtxt(csv, delimiter=",", names=True)[::8]
+    names = ("position_rad", "velocity_rad_s", "torque_nm", "position_command_rad")
+    columns: dict[str, Any] = {name: rows[name] for name in names}
+    time_ns = np.round(1e9 * rows["time_s"]).astype(np.int64)
+    thinned = Samples(joint="5", time_ns=time_ns, **columns)
+    half_a_row_s = 0.5 * float(np.median(np.diff(thinned.time_s)))
+    left_rad = simulate(load_robot(robot), thinned).position_rms_rad
+    assert left_rad < 0.1 * half_a_row_s * np.sqrt(np.mean(rows["velocity_rad_s"] ** 2))
 
 
 @pytest.mark.parametrize("name", ["profile.yaml", "simulated-5.csv"])
