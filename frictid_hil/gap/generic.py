@@ -33,6 +33,7 @@ def families(views: Sequence[View]) -> dict[str, list[Array]]:
     """Columns of every family, per view of shape (n, k)."""
     every = np.concatenate([v.position_rad for v in views])
     low, high = (float(end) for end in np.quantile(every, [0.001, 0.999]))
+    stiffness = [1.0 / max(r * (high - low), 1e-9) for r in REACHES]
     return {
         START: [_start(v) for v in views],
         **_of_position(views, low, high),
@@ -40,7 +41,7 @@ def families(views: Sequence[View]) -> dict[str, list[Array]]:
         **_of_time(views),
         "acceleration": [_accelerated(v) for v in views],
         "torque": _of_torque(views),
-        "travel": [_since_reversal(v, high - low) for v in views],
+        "travel": [np.stack([slip_state(v.position_rad, s) for s in stiffness], axis=1) for v in views],
     }
 
 
@@ -104,10 +105,6 @@ def _of_torque(views: Sequence[View]) -> list[Array]:
     top_nm = max(float(np.quantile(np.abs(v.torque_nm), 0.99)) for v in views)
     shares = [v.torque_nm / max(top_nm, 1e-12) for v in views]
     return [np.stack([t * np.abs(t), t**3], axis=1) for t in shares]
-
-
-def _since_reversal(v: View, travel_rad: float) -> Array:
-    return np.stack([slip_state(v.position_rad, 1.0 / max(r * travel_rad, 1e-9)) for r in REACHES], axis=1)
 
 
 @njit(cache=True)

@@ -15,7 +15,7 @@ from frictid_hil.gap.channel import FAMILY, Rows
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Sampled
 from frictid_hil.gap.forward import Replayed, pooled
-from frictid_hil.gap.posterior import Draw, Posterior, by_term, joined
+from frictid_hil.gap.posterior import Draw, Posterior, by_term, form_of, joined
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -52,18 +52,20 @@ class Closed:
 
 def closed(channel: Sampled, names: Collection[str], made: Collection[str] | None = None) -> Closed:
     """The gap of one channel without the named causes, and with them and what tolerances allow, or what is ``made``."""
-    draws = _without_generic(channel, names)
-    return closed_with(channel.posterior, [coefficients(channel, draw, made) for draw in draws])
+    draws, random = _without_generic(channel, names), np.random.default_rng(0)
+    every = [coefficients(channel, draw, made) for draw in draws]
+    as_formed = [] if made is None else [coefficients(channel, draw, made, random) for draw in draws]
+    return closed_with(channel.posterior, every, as_formed)
 
 
-def closed_with(posterior: Posterior, every: Sequence[Array]) -> Closed:
-    """The same with draws of coefficients of all the columns, (m,) each."""
+def closed_with(posterior: Posterior, every: Sequence[Array], as_formed: Sequence[Array] = ()) -> Closed:
+    """The same with draws of coefficients of all the columns, (m,) each, and as forms may have put them off."""
     judged = posterior.channel.judged
     constant = posterior.channel.level_free
     mean = np.mean(every, axis=0)
     nothing = np.zeros_like(mean)
     left = _left(judged, mean, constant)
-    apart = [_left(judged, theta, constant) - left for theta in every]
+    apart = [_left(judged, theta, constant) - left for theta in as_formed or every]
     after = rms(left)
     low, high = _interval(left, apart, posterior.channel.step_s)
     return Closed(
@@ -119,10 +121,19 @@ def _value(drawn: Sequence[float]) -> Value:
     return Value(float(middle), float(low), float(high))
 
 
-def coefficients(channel: Sampled, draw: Draw, made: Collection[str] | None = None) -> Array:
-    """Of all columns of the channel's table in one draw: 0 for functions without a name, and what is not ``made``."""
+def coefficients(
+    channel: Sampled, draw: Draw, made: Collection[str] | None = None, forms: np.random.Generator | None = None
+) -> Array:
+    """Of all columns of the channel's table in one draw: 0 for functions without a name, and what is not ``made``.
+
+    ``forms`` draws how far each cause is put off because no joint is quite as its formula.
+    """
     posterior, parts = channel.posterior, channel.posterior.contributions(draw)
-    told = [p for e, p in parts.items() if not e.startswith(FAMILY) and (made is None or e in made)]
+    told = []
+    for effect, (columns, values) in parts.items():
+        if not effect.startswith(FAMILY) and (made is None or effect in made):
+            off = 0.0 if forms is None else form_of(effect) * forms.standard_normal()
+            told.append((columns, (1.0 + off) * values))
     columns, values = joined(told) if told else (np.zeros(0, dtype=int), np.zeros(0))
     return np.bincount(columns, values, posterior.channel.logs[0].x.shape[1]).astype(np.float64)
 
@@ -152,15 +163,11 @@ def _appeared(posterior: Posterior, theta: Array) -> tuple[str, float] | None:
 
 def held_out(channel: Sampled) -> dict[str, float]:
     """By effect, change of the validation logs' squares when it alone is added to tolerances, percent."""
-    posterior = channel.posterior
-    judged = posterior.channel.judged
-
-    def squares(theta: Array) -> float:
-        return float(np.sum(_left(judged, theta, posterior.channel.level_free) ** 2))
-
-    bare = squares(posterior.fitted(()))
-    alone = {name: squares(posterior.fitted((term,))) for name, term in posterior.singles().items()}
-    return {name: round(100.0 * (left / bare - 1.0), 2) for name, left in alone.items() if bare > 0.0}
+    posterior, singles = channel.posterior, channel.posterior.singles()
+    judged, free = posterior.channel.judged, posterior.channel.level_free
+    models = [(), *((term,) for term in singles.values())]
+    bare, *alone = (float(np.sum(_left(judged, posterior.fitted(model), free) ** 2)) for model in models)
+    return {name: round(100.0 * (left / bare - 1.0), 2) for name, left in zip(singles, alone, strict=True) if bare}
 
 
 def simulated(differences: Mapping[str, Replayed]) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from frictid_hil.gap.residuals import Recording
 from frictid_hil.gap.verdict import DOUBTED, TIED, Verdict
 from frictid_hil.gap.where import lives, where
 
+FIGURES = {"plant": "inverse_nm", "tracking": "forward_position_rad"}  # by channel, what its gap is told as
 PARTLY = 0.4
 """Most that is claimed of causes that explain a part of a gap whose rest has no name: that rest may have passed for
 them. Of such causes 73 of 104 were there in joints of the wide world, and hardly one of those of the narrow world."""
@@ -59,7 +60,7 @@ def told(
         before=before,
         after=after,
         noise_floor=floor,
-        after_intervals=_intervals(gaps) if applied else {},
+        after_intervals={FIGURES[g.channel]: (g.low, g.high) for g in gaps if applied and g.channel in FIGURES},
         per_log={
             log: {when: Figures(None, *simulated({log: run[log]})) for when, run in runs.items()} for log in bare or ()
         },
@@ -102,12 +103,6 @@ def _figures(
     floor = None if inverse is None else min(inverse.floor, inverse.before)
     still = None if tracking is None else min(tracking.floor, tracking.before)
     return Figures(ends[0], *forward["before"]), Figures(ends[1], *forward["after"]), Figures(floor, noise, still)
-
-
-def _intervals(gaps: Sequence[Closed]) -> dict[str, tuple[float, float]]:
-    """95 % intervals of what is left, by the name of the figure."""
-    told = {"plant": "inverse_nm", "tracking": "forward_position_rad"}
-    return {told[gap.channel]: (gap.low, gap.high) for gap in gaps if gap.channel in told}
 
 
 def _causes(said: Verdict, channels: Sequence[Sampled], gaps: Sequence[Closed]) -> tuple[Cause, ...]:
