@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gap_sets
 import numpy as np
 import pytest
 
+from frictid_hil.config.nominal import Tolerance
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.forward import Replay, Replayed, pooled
 from frictid_hil.gap.how_far import _interval
+from frictid_hil.gap.tolerances import Tolerances
 
 STEP_S = 0.02
 TRUE = np.array([0.4, 1.0])  # coefficients of what is left and of what a cause makes, N m
@@ -61,6 +65,22 @@ def test_what_was_fitted_within_tolerances_is_reported_and_in_the_improved_joint
     alone = {name: model.effects[name] for name in cause}
     left = pooled(Replay(experiments)(alone, validation=True), "torque_nm")
     assert found.after.forward_torque_nm is not None and found.after.forward_torque_nm < 0.9 * left
+
+
+@pytest.mark.slow
+def test_the_gap_after_is_that_of_the_joint_that_is_written() -> None:
+    """The belief corrected by what was told leaves as much: a row that is late has no number, and stays."""
+    made = gap_sets.make({"gravity_error": {"error_share": 0.1}}, noise_nm=0.08)
+    late = [replace(e, torque_nm=0.8 * e.torque_nm + 0.2 * np.roll(e.torque_nm, 1)) for e in made.experiments]
+    known = {name: 1e-4 for name in ("inertia_kg_m2", "friction_torque", "viscous", "torque_constant")}
+    sure = Tolerances.of(Tolerance(**known, absolute={"zero_offset_rad": 1e-6}))
+    experiments = replace(made, nominal=replace(made.nominal, tolerances=sure), experiments=tuple(late))
+    found = diagnose(experiments)
+    assert found.causes[0].effect == "gravity_error"
+    gravity_nm = made.nominal.gravity_cos_nm * (1.0 + found.causes[0].parameters["error_share"].value)
+    corrected = replace(experiments.nominal, gravity_cos_nm=gravity_nm)
+    left = diagnose(replace(experiments, nominal=corrected), library=()).before.inverse_nm
+    assert found.after.inverse_nm == pytest.approx(left, rel=0.02)
 
 
 def test_a_closed_loop_is_told_from_where_a_log_has_settled() -> None:
