@@ -39,6 +39,7 @@ from frictid_hil.gap.verdict import (
     SHOWS,
     TIED,
     Verdict,
+    as_stated,
     stays,
     swings,
     unreached,
@@ -149,6 +150,9 @@ def _answer(joint: Prepared, reading: Reading, negligible: float) -> Diagnosis:
     if said.word == "unknown" and asked and below(nothing_nm, gaps, joint.simulation):
         said = Verdict("none", ())  # somebody has said that it means nothing
     said = _cautious(said, reasons, any(r.experiment.validation for r in joint.logs))
+    if said.word == "explained":  # what a belief allows for anyway comes after what it does not
+        first = sorted(said.named, key=lambda f: f.confidence < EVEN or as_stated([f], channels))
+        said = replace(said, named=tuple(first))
     gaps = gaps if reading.along is None else [*gaps, *gaps_left([reading.along], said.named)]
     return told(joint, reading, gaps, said, reasons)
 

@@ -124,10 +124,7 @@ def _value(drawn: Sequence[float]) -> Value:
 def coefficients(
     channel: Sampled, draw: Draw, made: Collection[str] | None = None, forms: np.random.Generator | None = None
 ) -> Array:
-    """Of all columns of the channel's table in one draw: 0 for functions without a name, and what is not ``made``.
-
-    ``forms`` draws how far each cause is put off because no joint is quite as its formula.
-    """
+    """Of all columns in one draw: 0 for what has no name or is not ``made``; ``forms`` draws how far each is off."""
     posterior, parts = channel.posterior, channel.posterior.contributions(draw)
     told = []
     for effect, (columns, values) in parts.items():

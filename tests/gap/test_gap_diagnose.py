@@ -322,3 +322,13 @@ def test_the_closed_loop_judges_how_the_recordings_were_read(
     answer = diagnose(cast(ExperimentSet, None))
     assert answer.causes[0].effect == first
     assert ("link" in answer.reasons) is (first == "inertia_error")
+
+
+@pytest.mark.slow
+def test_an_error_that_a_belief_allows_for_comes_after_what_it_does_not() -> None:
+    """A level 2 % off makes more than this bias, and is a fifth of its tolerance."""
+    found = diagnose(gap_sets.make({"friction_level_error": {"error_share": 0.02}, "torque_bias": {"bias_nm": 0.05}}))
+    bias, level = found.causes
+    assert (bias.effect, level.effect) == ("torque_bias", "friction_level_error")
+    assert bias.gap_closed_percent is not None and level.gap_closed_percent is not None
+    assert level.gap_closed_percent > bias.gap_closed_percent
