@@ -5,7 +5,8 @@
 
 The believed friction of every healthy joint of the checks that were kept is scaled, its presliding with it. What is
 asked: ``friction_level_error``, an error within its tolerance, or ``none`` where that means nothing; another first
-cause with 0.5 or more is counted, and how often the level is not told with as much beside it.
+cause with 0.5 or more is counted, how often truth has nothing of it, and how often the level is not told with as much
+beside it. A healthy joint has errors within its tolerances, and forms of friction that are not quite the library's.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ class Asked:
 
     folder: Path
     off: float
+    there: frozenset[str]  # causes of which truth has something, be it within a tolerance
 
 
 def main() -> None:
@@ -42,28 +44,36 @@ def main() -> None:
     for folder in options.folders:
         if not (folder / "truth").is_dir():
             parser.error(f"{folder}: no truth here; gap check --out keeps it")
-    asked = [Asked(case, off) for folder in options.folders for case in healthy(folder) for off in OFF]
+    asked = [one for folder in options.folders for one in healthy(folder)]
     with ProcessPoolExecutor(options.jobs) as pool:
         found = list(zip(asked, pool.map(answered, asked), strict=True))
     for one, answer in found:
         if taken(answer):
             told = ", ".join(f"{cause.effect} {cause.confidence:.2f}" for cause in answer.causes)
             print(f"{one.folder} {one.off:+.0%}: {told}")
-    print("| off | another first cause | of them, level not told | none | of |\n|---|---|---|---|---|")
+    print("| off | another first cause | of them, not there | of them, level not told | none | of |")
+    print("|---|---|---|---|---|---|")
     for off in (*OFF, None):
-        answers = [answer for one, answer in found if off in (None, one.off)]
-        others = [answer for answer in answers if taken(answer)]
-        silent = sum(told_with(answer, LEVEL) < LIKELY for answer in others)
-        quiet = sum(answer.verdict == "none" for answer in answers)
+        answers = [(one, answer) for one, answer in found if off in (None, one.off)]
+        others = [(one, answer) for one, answer in answers if taken(answer)]
+        absent = sum(answer.causes[0].effect not in one.there for one, answer in others)
+        silent = sum(told_with(answer, LEVEL) < LIKELY for _, answer in others)
+        quiet = sum(answer.verdict == "none" for _, answer in answers)
         rate = Rate(len(others), len(answers)).to_json()
         share = f"{rate['right']} ({rate['low']:.0%} to {rate['high']:.0%})" if answers else "0"
-        print(f"| {'all' if off is None else f'{off:+.0%}'} | {share} | {silent} | {quiet} | {len(answers)} |")
+        row = "all" if off is None else f"{off:+.0%}"
+        print(f"| {row} | {share} | {absent} | {silent} | {quiet} | {len(answers)} |")
 
 
-def healthy(folder: Path) -> list[Path]:
-    """Folders of the joints of a check that have no fault."""
+def healthy(folder: Path) -> list[Asked]:
+    """The joints of a check that have no fault, each believed off in every way."""
     truths = [yaml.safe_load(path.read_text()) for path in sorted((folder / "truth").glob("*.yaml"))]
-    return [folder / "cases" / truth["case"] for truth in truths if truth["kind"] == "none"]
+    return [
+        Asked(folder / "cases" / truth["case"], off, frozenset([*truth["present"], *truth["neutral"]]))
+        for truth in truths
+        if truth["kind"] == "none"
+        for off in OFF
+    ]
 
 
 def answered(one: Asked) -> Diagnosis:

@@ -61,10 +61,12 @@ from frictid_hil.gap import (
     residuals,
     rigid_column,
     smoothing,
+    tick_timing,
     tracking_channel,
     verdict,
 )
 from frictid_hil.gap import diagnose as diagnosis
+from frictid_hil.gap import told as telling
 from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay
@@ -83,7 +85,7 @@ LATE: tuple[tuple[ModuleType, str], ...] = (
     (borne_out, "BOUNCED"), (borne_out, "REFUTED"), (borne_out, "FAR"), (link_in_loop, "LOGS"),
     (link_in_loop, "SPREAD"),
     (how_far, "COLOUR"), (how_far, "APPEARED"), (how_far, "WINDOW_S"),
-    (quiet, "NEGLIGIBLE"), (quiet, "LOUD"), (diagnosis, "UNDECIDED"),
+    (quiet, "NEGLIGIBLE"), (quiet, "LOUD"), (telling, "PARTLY"), (diagnosis, "UNDECIDED"),
 )  # fmt: skip
 """What is said of a posterior."""
 SEARCHED: tuple[tuple[ModuleType, str], ...] = (
@@ -104,14 +106,15 @@ TABLES: tuple[tuple[ModuleType, str], ...] = (
     (rigid_column, "APART"), (rigid_column, "FILTERS_HZ"), (rigid_column, "ON_AND_ON_RAD"),
     (smoothing, "CLIFF_DB"), (smoothing, "SILENT_DB"), (smoothing, "BELOW_DB"), (smoothing, "OWN_DB"),
     (smoothing, "LEAST_HZ"), (smoothing, "MOST_HZ"), (smoothing, "KEPT"), (smoothing, "PART_S"),
-    (plant_channel, "SEVERAL"), (nuisances, "ANYWHERE"), (position_noise, "NOISE_SHARE"), (tracking_channel, "SPREAD"),
+    (plant_channel, "SEVERAL"), (nuisances, "ANYWHERE"), (nuisances, "REVERSING"),
+    (tick_timing, "CLEARLY"), (position_noise, "NOISE_SHARE"), (tracking_channel, "SPREAD"),
 )  # fmt: skip
 """The tables of the channels."""
 SIMULATED: tuple[tuple[ModuleType, str], ...] = ((forward, "RIGID_SUBSTEP_S"),)
 """The joint under its controller."""
 CHANCES = (
     "SIDED", "DOUBTED", "NEEDED", "CERTAIN", "LEADS", "EVEN", "UNTOLD", "REFUTED", "UNDECIDED", "LISTED", "CLEARLY",
-    "EITHER", "HELPS", "FAIR_SHARE", "TIE", "LIKELY", "READ", "ONE_PART", "KEPT",
+    "EITHER", "PARTLY", "HELPS", "FAIR_SHARE", "TIE", "LIKELY", "READ", "ONE_PART", "KEPT",
 )  # fmt: skip
 
 Answer = tuple[str, str]

@@ -10,11 +10,12 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import STIFFNESS, Builder, Term
 from frictid_hil.gap.experiment_set import Nominal
+from frictid_hil.gap.posterior import FORM
 from frictid_hil.gap.residuals import Recording, friction_scales, presliding_state
 from frictid_hil.gap.rigid_column import IN_COLUMN, held_by_column
 from frictid_hil.gap.tolerances import Sigma
 from frictid_hil.simulation.effects import all_effects
-from frictid_hil.simulation.inverse import View
+from frictid_hil.simulation.inverse import REVERSING, View, top_speed_rad_s
 
 FREE = 10.0  # one-sigma of a share that was fitted to these very logs: nothing is believed of it
 SAME_RATE = 0.05  # rows and control ticks are the same where their rates differ by no more than this share
@@ -104,22 +105,21 @@ def _timing(nominal: Nominal, views: Sequence[View], builder: Builder) -> list[T
 def _friction_shape(nominal: Nominal, views: Sequence[View], builder: Builder) -> list[Term]:
     """Presliding stiffness, the damping of a bristle up to half of the critical one, the curve below its first pair."""
     _, stiffness = friction_scales(nominal)
-    stiffer = []
-    for v in views:
-        slip = presliding_state(nominal, v.position_rad, 1.0 + STIFFER)
-        stiffer.append((v.coulomb_nm * (slip - v.slip) / STIFFER)[:, None])
+    slips = [presliding_state(nominal, v.position_rad, 1.0 + STIFFER) for v in views]
+    stiffer = [(v.coulomb_nm * (slip - v.slip) / STIFFER)[:, None] for v, slip in zip(views, slips, strict=True)]
     stated = nominal.presliding_stiffness_nm_per_rad is not None
     deviation = nominal.tolerances.presliding_stiffness.of(stiffness) / stiffness if stated else 1.0
-    numbers = builder.add(stiffer)
-    terms = [
-        Term("presliding_hysteresis" if stated else "", {STIFFNESS: 1.0}, numbers, np.zeros(1), np.array([deviation]))
-    ]
+    name = "presliding_hysteresis" if stated else ""
+    terms = [Term(name, {STIFFNESS: 1.0}, builder.add(stiffer), np.zeros(1), np.array([deviation]))]
     if nominal.yields_gradually and nominal.inertia_kg_m2:
         bent = [v.coulomb_nm / v.stiffness_nm_per_rad * np.gradient(v.slip, v.step_s)[:, None] for v in views]
         terms.append(_term("", builder.add(bent), math.sqrt(stiffness * nominal.inertia_kg_m2)))
-    bend_nm = _unmeasured_nm(nominal)
-    if bend_nm != 0.0:
-        below = [(bend_nm * v.slip - _above(nominal, v, bend_nm))[:, None] for v in views]
+    off_nm = abs(_unmeasured_nm(nominal))
+    if nominal.curve is not None and nominal.curve.velocity_rad_s[0] < REVERSING * top_speed_rad_s(views):
+        # Nothing slides there for long: what friction does is as little known as what it does before it slides.
+        off_nm = max(off_nm, FORM * nominal.curve.coulomb_nm)
+    if off_nm != 0.0:
+        below = [(off_nm * v.slip - _above(nominal, v, off_nm))[:, None] for v in views]
         terms.append(_term("", builder.add(below), 1.0))
     return terms
 

@@ -52,6 +52,15 @@ class View:
         return left
 
 
+REVERSING = 0.1
+"""Speed over the largest one, below which a joint hardly slides: it is on its way through a reversal."""
+
+
+def top_speed_rad_s(views: Sequence[View]) -> float:
+    """The largest speed of some recordings; one row in a hundred may be a jump of the encoder."""
+    return max(float(np.quantile(np.abs(v.velocity_rad_s), 0.99)) for v in views)
+
+
 @dataclass(frozen=True, slots=True)
 class InverseForm:
     """Columns that an effect adds to the torque balance."""

@@ -16,9 +16,11 @@ from frictid_hil.config.profile import Estimate, JointProfile
 from frictid_hil.errors import ConfigError, InputFileError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.channel import Builder, taken
 from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet
 from frictid_hil.gap.forward import nominal_model
-from frictid_hil.gap.nuisances import bent_rate_nm
+from frictid_hil.gap.nuisances import bent_rate_nm, nuisances
+from frictid_hil.gap.posterior import FORM
 from frictid_hil.gap.residuals import controller_demand, demand_of, demand_parts, recordings
 from frictid_hil.gap.sanity import checked
 from frictid_hil.gap.tolerances import RELATIVE_BY_KIND, Tolerances, stated_by
@@ -216,3 +218,20 @@ def test_what_depends_on_speed_begins_where_the_curve_does() -> None:
     assert not np.allclose(r.view.rate_nm[measured], expected, atol=0.1)
     straight = replace(nominal, curve=FrictionCurve.through(speeds, 2.6 + 1.6 * speeds))
     assert bent_rate_nm(straight, [r.view]) == []
+
+
+def test_nobody_knows_friction_below_a_first_pair_that_is_passed_in_reversals_alone() -> None:
+    """Where the first pair is high, the recordings slide below it, and tell."""
+    (r, *_) = recordings(gap_sets.make(only=("sines_large",)))
+    assert r.view is not None
+    counts = {}
+    for first in (0.02, 0.5):
+        curve = FrictionCurve.through(np.array([first, 0.8, 1.8]), np.array([3.2, 3.2, 3.2]))
+        builder = Builder([[]])
+        terms = nuisances(replace(gap_sets.NOMINAL, curve=curve), [r.view], [r], builder, ())
+        counts[first] = len(terms)
+        if first == 0.02:
+            near_rest = taken(builder.parts[0], terms[-1].columns)[:, 0]
+    assert counts[0.02] == counts[0.5] + 1
+    assert np.max(np.abs(near_rest)) == pytest.approx(FORM * 3.2, rel=0.2)
+    assert not np.any(near_rest[np.abs(r.view.velocity_rad_s) > 0.02])

@@ -204,6 +204,32 @@ def test_a_curve_concave_below_its_first_pair_is_no_stribeck_without_a_warning(
     assert not named or "0.2 rad/s" in found.reasons["stribeck"]
 
 
+@pytest.mark.parametrize(
+    ("rest", "loop"),
+    [
+        (0.95, False),
+        pytest.param(0.95, True, marks=pytest.mark.slow),
+        pytest.param(0.9, False, marks=pytest.mark.slow),
+        pytest.param(0.9, True, marks=pytest.mark.slow),
+    ],
+)
+def test_a_level_that_is_off_is_no_curve_because_of_what_nobody_measured_near_rest(rest: float, loop: bool) -> None:
+    """Below a hundredth of its largest speed friction falls by 5 or 10 %, and all of it is believed 10 % too low."""
+    speeds = np.geomspace(0.02, 2.0, 10)
+    torques = 2.6 + 0.5 * speeds
+    true = FrictionCurve.through(np.array([0.003, *speeds]), np.array([rest * torques[0], *torques]))
+    made = gap_sets.make(nominal=replace(gap_sets.NOMINAL, curve=true))
+    low = replace(
+        gap_sets.NOMINAL,
+        curve=FrictionCurve.through(speeds, 0.9 * torques),
+        presliding_stiffness_nm_per_rad=0.9 * 20000.0,
+    )
+    found = diagnose(_as_told(replace(made, nominal=low), loop))
+    assert found.verdict == "explained" and found.causes[0].effect == "friction_level_error"
+    assert found.causes[0].parameters["error_share"].value == pytest.approx(1 / 0.9 - 1, abs=0.01)
+    assert {c.effect for c in found.causes} <= {"friction_level_error", "presliding_hysteresis"}
+
+
 @pytest.mark.slow
 def test_a_true_stribeck_effect_is_named_and_carries_the_warning() -> None:
     effect = {"stribeck": {"share": 0.3, "stribeck_velocity_rad_s": 0.06, "exponent": 1.4}}

@@ -147,6 +147,24 @@ def test_a_bend_of_one_is_plain_viscosity(share: float) -> None:
     np.testing.assert_allclose(steady_friction_nm(logarithm, v), steady_friction_nm(nearly, v), rtol=1e-3)
 
 
+def test_bends_are_tried_at_the_speeds_that_a_joint_comes_to() -> None:
+    """A motor is no slow joint; and what is over before a joint is out of its reversals is a level, not a bend."""
+    form = all_effects()["viscous_nonlinearity"].inverse
+    assert form is not None
+
+    def tried(top: float) -> list[dict[str, float]]:
+        speed = top * np.sin(np.linspace(0.0, 20.0, 2000))
+        return [dict(shape) for shape in form.grid_for([SimpleNamespace(velocity_rad_s=speed, rate_nm=0.1 * speed)])]
+
+    for slow, fast in zip(tried(1.0), tried(60.0), strict=True):
+        assert fast == pytest.approx({**slow, "knee_rad_s": 60.0 * slow["knee_rad_s"]})
+        effect = {"viscous_nonlinearity": {"share": 1.0, **slow}}
+        added = steady_friction_nm(bare(effects=effect), np.array([0.1, 1.0])) - steady_friction_nm(
+            bare(), np.array([0.1, 1.0])
+        )
+        assert slow["bend"] >= 0.0 or added[0] < 0.5 * added[1]
+
+
 def test_asymmetry_is_even_and_leaves_the_odd_curve_alone() -> None:
     model = bare(effects={"direction_asymmetry": {"coulomb_share": 0.1, "viscous_share": 0.2}})
     v = np.array([0.2, 1.0])

@@ -9,7 +9,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
-from frictid_hil.simulation.inverse import Shape, View, grid, shared
+from frictid_hil.simulation.inverse import REVERSING, Shape, View, grid, shared, top_speed_rad_s
 
 
 def rate(
@@ -35,12 +35,17 @@ def column(v: View, shape: Shape) -> Array:
 def shapes(views: Sequence[View]) -> tuple[Shape, ...]:
     """Bends to try; a straight line only where no rate is believed, as it is an error of the rate elsewhere."""
     believed = any(np.any(v.rate_nm != 0.0) for v in views)
-    return BENDS if believed else (*BENDS, {"knee_rad_s": 0.2, "bend": 1.0})
+    top_rad_s = top_speed_rad_s(views)
+    tried = BENDS if believed else (*BENDS, {"knee_rad_s": REVERSING, "bend": 1.0})
+    return tuple({**shape, "knee_rad_s": shape["knee_rad_s"] * top_rad_s} for shape in tried)
 
 
-BENDS = grid(knee_rad_s=(0.02, 0.06, 0.2, 0.6, 1.8), bend=(0.0, 0.5, 2.0, 3.0)) + grid(
-    knee_rad_s=(0.2, 0.6, 1.8), bend=(-3.0, -1.5)
+BENDS = (
+    *grid(knee_rad_s=(0.01, 0.03, 0.1, 0.3, 1.0), bend=(0.0, 0.5, 2.0, 3.0)),
+    *grid(knee_rad_s=(0.3, 1.0), bend=(-1.5,)),
+    {"knee_rad_s": 1.0, "bend": -3.0},
 )
+"""Knees over the largest speed in half decades, and exponents. What saturates at ``REVERSING`` is a level."""
 
 
 def _illustrate(p: Mapping[str, float]) -> Illustration:
@@ -64,7 +69,7 @@ EFFECT = Effect(
     ),
     parameters=(
         Parameter("share", -3.0, 3.0, 0.4, "size, fraction of the Coulomb level", off=0.0),
-        Parameter("knee_rad_s", 0.02, 5.0, 0.4, "speed at which the bend sets in"),
+        Parameter("knee_rad_s", 1e-3, 100.0, 0.4, "speed at which the bend sets in"),
         Parameter("bend", -4.0, 3.0, 0.2, "exponent p: below 1 saturates, above 1 stiffens"),
     ),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND,)),
