@@ -154,7 +154,8 @@ def test_bends_are_tried_at_the_speeds_that_a_joint_comes_to() -> None:
 
     def tried(top: float) -> list[dict[str, float]]:
         speed = top * np.sin(np.linspace(0.0, 20.0, 2000))
-        return [dict(shape) for shape in form.grid_for([SimpleNamespace(velocity_rad_s=speed, rate_nm=0.1 * speed)])]
+        view: Any = SimpleNamespace(velocity_rad_s=speed, rate_nm=0.1 * speed)
+        return [dict(shape) for shape in form.grid_for([view])]
 
     for slow, fast in zip(tried(1.0), tried(60.0), strict=True):
         assert fast == pytest.approx({**slow, "knee_rad_s": 60.0 * slow["knee_rad_s"]})
