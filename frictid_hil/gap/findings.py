@@ -199,8 +199,7 @@ def _not_taken_back(inner: Array, wholes: np.ndarray) -> Array:
     """
     along = inner / np.sqrt(np.maximum(np.diag(inner), 1e-300))
     stays = np.minimum(np.abs(along), np.maximum(0.0, np.sign(along) * along.sum(axis=0)))
-    most: Array = np.where(wholes, np.max(stays, axis=1, initial=0.0), np.diag(stays))
-    return most
+    return np.asarray(np.where(wholes, np.max(stays, axis=1, initial=0.0), np.diag(stays)))
 
 
 def findings(channels: Sequence[Sampled]) -> list[Finding]:
@@ -303,8 +302,7 @@ def _beyond(size: Array, lent: Array, tolerated: Array, believed: Array, prior: 
     """
     narrow, wide = tolerated**2 + lent**2, believed**2 + lent**2
     odds = 0.5 * size**2 * (1.0 / narrow - 1.0 / wide) - 0.5 * np.log(wide / narrow)
-    chance: Array = special.expit(special.logit(prior) + odds)
-    return chance
+    return np.asarray(special.expit(special.logit(prior) + odds))
 
 
 def _chances(size: Array, blur: Array, believed: Array) -> tuple[Array, Array, Array]:

@@ -13,7 +13,7 @@ from numba import njit
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.residuals import slip_state
-from frictid_hil.simulation.inverse import View
+from frictid_hil.simulation.inverse import View, motion_scale, top_speed_rad_s
 from frictid_hil.simulation.inverse_loops import lagged
 
 START = "start"
@@ -35,7 +35,7 @@ def families(views: Sequence[View]) -> dict[str, list[Array]]:
     low, high = (float(end) for end in np.quantile(every, [0.001, 0.999]))
     stiffness = [1.0 / max(r * (high - low), 1e-9) for r in REACHES]
     return {
-        START: [_start(v) for v in views],
+        START: [_start(v, motion_scale(views) * np.array(WAYS_RAD)) for v in views],
         **_of_position(views, low, high),
         **_of_velocity(views),
         **_of_time(views),
@@ -45,9 +45,9 @@ def families(views: Sequence[View]) -> dict[str, list[Array]]:
     }
 
 
-def _start(v: View) -> Array:
+def _start(v: View, ways_rad: Array) -> Array:
     way, rest = since_start(v.position_rad, v.step_s, 2.0 * v.coulomb_nm / v.stiffness_nm_per_rad)
-    fading = v.slip[:, None] * np.exp(-way[:, None] / np.array(WAYS_RAD))
+    fading = v.slip[:, None] * np.exp(-way[:, None] / ways_rad)
     return np.concatenate([fading, fading * np.log1p(rest / REST_S)[:, None]], axis=1)
 
 
@@ -63,8 +63,7 @@ def _of_position(views: Sequence[View], low_rad: float, high_rad: float) -> dict
 
 
 def _of_velocity(views: Sequence[View]) -> dict[str, list[Array]]:
-    top = max(float(np.quantile(np.abs(v.velocity_rad_s), 0.99)) for v in views)
-    knots = max(top, 1e-9) * np.array([0.01, 0.03, 0.08, 0.2, 0.45, 0.8])
+    knots = max(top_speed_rad_s(views), 1e-9) * np.array([0.01, 0.03, 0.08, 0.2, 0.45, 0.8])
 
     def hats(v: View) -> Array:
         return np.stack([np.interp(np.abs(v.velocity_rad_s), knots, row) for row in np.eye(knots.size)], axis=1)

@@ -86,8 +86,7 @@ def drift_nm(torque_nm: Array, position_rad: Array, reach_rad: float, step_s: fl
     stands[:window] = False
     comes = stands & ~np.concatenate([[False], stands[:-1]])
     since = np.maximum.accumulate(np.where(comes, np.arange(stands.size), 0))
-    drift: Array = np.where(stands, torque_nm - torque_nm[since], 0.0)
-    return drift
+    return np.asarray(np.where(stands, torque_nm - torque_nm[since], 0.0))
 
 
 def _rows(r: Recording, gap: Replayed, table: np.ndarray, noise_nm: np.ndarray, low_pass: LowPass) -> Rows:

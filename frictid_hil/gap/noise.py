@@ -35,8 +35,7 @@ def autocovariance(residuals: Sequence[Array], rows_per_freedom: float = 1.0) ->
 
 def slow(variance: float, memory_rows: float) -> Array:
     """Autocovariance of a first-order memory, shape (ORDER + 1,)."""
-    lags: Array = variance * np.exp(-np.arange(ORDER + 1) / memory_rows)
-    return lags
+    return np.asarray(variance * np.exp(-np.arange(ORDER + 1) / memory_rows))
 
 
 def whitening(covariance: Array) -> tuple[Array, float]:

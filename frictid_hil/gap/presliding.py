@@ -19,6 +19,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.forward import Replay, pooled, why_not
 from frictid_hil.gap.residuals import Recording, presliding_state, recordings
+from frictid_hil.simulation.inverse import motion_scale
 
 GRADUALLY = (
     "the file states a presliding stiffness and not how presliding yields: 'gradually' (Dahl, LuGre) fits these "
@@ -31,6 +32,7 @@ FURTHER = (
 TRAVEL = "no presliding stiffness is stated: friction builds up over {now:.2g} rad in these recordings"
 TRAVELS = (0.04, 0.2, 5.0, 25.0)
 """Travels that are tried beside the usual one, over it, where none is stated: a ball bearing's to a soft gear's."""
+CLOSER = (0.45, 0.67, 1.5, 2.2), (0.82, 1.22), (0.9, 1.1)  # the same over the best one so far
 SLOW_RAD_S = (0.01, 0.05)
 """Speeds over which friction may fall when sliding begins: what a Stribeck effect makes is not the form's."""
 BEGINS_RAD_S = 0.02  # speed at which friction counts as that of a joint that begins to slide
@@ -62,13 +64,14 @@ def as_it_yields(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]
 def _with_best_travel(experiments: ExperimentSet, logs: Sequence[Recording]) -> tuple[ExperimentSet, str | None]:
     """The set whose friction builds up over the travel that fits its recordings clearly best."""
     nominal = experiments.nominal
-    forms = [replace(nominal, presliding_travel_rad=f * nominal.presliding_travel_rad) for f in TRAVELS]
-    left = [_fit(logs, form)[0] for form in forms]
-    best = int(np.argmin(left))
-    if left[best] > CLEARLY * _fit(logs, nominal)[0]:
+    best, left = nominal, {nominal.presliding_travel_rad: _fit(logs, nominal)[0]}
+    for factors in (TRAVELS, *CLOSER):
+        forms = [replace(best, presliding_travel_rad=f * best.presliding_travel_rad) for f in factors]
+        left |= {form.presliding_travel_rad: _fit(logs, form)[0] for form in forms}
+        best = replace(best, presliding_travel_rad=min(left, key=lambda travel_rad: left[travel_rad]))
+    if left[best.presliding_travel_rad] > CLEARLY * left[nominal.presliding_travel_rad]:
         return experiments, None
-    told = TRAVEL.format(now=forms[best].presliding_travel_rad)
-    return replace(experiments, nominal=forms[best]), told
+    return replace(experiments, nominal=best), TRAVEL.format(now=best.presliding_travel_rad)
 
 
 def _nearer_in_the_loop(experiments: ExperimentSet, form: Nominal) -> bool:
@@ -101,12 +104,12 @@ def _with_own_travel(
 
 def _fit(logs: Sequence[Recording], form: Nominal) -> tuple[float, float]:
     """(squares of the torque that one form leaves, friction where sliding begins), belief and Stribeck fitted along."""
-    tables = []
+    tables, scale = [], motion_scale([v for log in logs if (v := log.view) is not None])
     for log in logs:
         v, low_pass = log.view, log.low_pass
         assert v is not None and log.plant_nm is not None
         state = presliding_state(form, v.position_rad)
-        falling = [state * np.exp(-np.abs(v.velocity_rad_s) / slow) for slow in SLOW_RAD_S]
+        falling = [state * np.exp(-np.abs(v.velocity_rad_s) / (scale * slow)) for slow in SLOW_RAD_S]
         believed = v.coulomb_nm * (state - v.slip)
         columns: list[Array] = [state, *falling, v.velocity_rad_s, v.acceleration_rad_s2, np.ones_like(state)]
         columns += [np.cos(v.position_rad), np.sin(v.position_rad), np.gradient(v.torque_nm, v.step_s)]

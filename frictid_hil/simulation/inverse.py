@@ -6,6 +6,7 @@ enter nonlinearly) a few, whose coefficients enter linearly, and from both of th
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -61,6 +62,22 @@ def top_speed_rad_s(views: Sequence[View]) -> float:
     return max(float(np.quantile(np.abs(v.velocity_rad_s), 0.99)) for v in views)
 
 
+def motion_scale(views: Sequence[View]) -> float:
+    """Whole decades by which a joint is faster than an ordinary one, as a factor: a motor, or an axis in metres."""
+    top_rad_s = top_speed_rad_s(views)
+    return 10.0 ** math.trunc(math.log10(top_rad_s / ORDINARY_RAD_S)) if top_rad_s > 0.0 else 1.0
+
+
+ORDINARY_RAD_S = 2.0
+"""Largest speed of an ordinary joint: grids of speeds and ways are made for a tenth of it to ten times as much."""
+
+
+def to_scale(of_motion: str, shapes: tuple[Shape, ...], views: Sequence[View]) -> tuple[Shape, ...]:
+    """The shapes, and for a joint that is no ordinary one also those with a speed or a way at its own scale."""
+    scale = motion_scale(views)
+    return shapes if scale == 1.0 else (*shapes, *({**s, of_motion: scale * s[of_motion]} for s in shapes))
+
+
 @dataclass(frozen=True, slots=True)
 class InverseForm:
     """Columns that an effect adds to the torque balance."""
@@ -110,9 +127,16 @@ def shared(
     shapes: tuple[Shape, ...],
     column: Callable[[View, Shape], Array],
     bounds: tuple[float, float] = (0.0, math.inf),
+    *,
+    of_motion: str = "",
     **more: Any,
 ) -> InverseForm:
-    """The form of an effect of a ``share`` and a shape: N m per unit of the share along a view, (n,)."""
+    """The form of an effect of a ``share`` and a shape: N m per unit of the share along a view, (n,).
+
+    ``of_motion`` is a number of the shape that goes with the joint's scale, a speed or a way.
+    """
+    if of_motion:
+        more["shapes_for"] = functools.partial(to_scale, of_motion, shapes)
     return InverseForm(
         shapes=shapes,
         regressors=lambda views, shape: [column(v, shape)[:, None] for v in views],

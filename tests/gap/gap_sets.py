@@ -90,7 +90,7 @@ def make(
                 time_s=time,
                 position_rad=rows.position_rad,
                 velocity_rad_s=rows.velocity_rad_s,
-                torque_nm=np.round(torque / 0.012) * 0.012,
+                torque_nm=np.round(torque / nominal.torque_quantum_nm) * nominal.torque_quantum_nm,
                 position_command_rad=command,
             )
         )

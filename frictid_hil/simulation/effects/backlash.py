@@ -9,7 +9,15 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import Link, TrackingForm
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import Shape, View, behind_transmission, grid, most_telling, through_transmission
+from frictid_hil.simulation.inverse import (
+    Shape,
+    View,
+    behind_transmission,
+    grid,
+    most_telling,
+    motion_scale,
+    through_transmission,
+)
 
 
 def play(play_rad: float, gap_rad: float) -> float:
@@ -33,7 +41,7 @@ def coupling_damping(
     return max(coupling_nm_s_per_rad, contact_relaxation_s * coupling_nm_per_rad)
 
 
-STIFFNESS_BOUNDS = (100.0, 1e7)  # from a wrist of 0.01 kg m2 to a base joint of tens of kg m2 that rings at 100 Hz
+STIFFNESS_BOUNDS = (1e-4, 1e12)  # from the motor of a hobby servo to an axis in metres that carries tons
 
 
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
@@ -56,9 +64,10 @@ def shapes_for(views: Sequence[View]) -> tuple[Shape, ...]:
     link = max((v.link_inertia_kg_m2 for v in views), default=0.0)
     if link <= 0.0:
         return SHAPES
-    coarse = [_shape(link, gap_rad, *contact) for contact in CONTACTS for gap_rad in GAPS_RAD]
+    gaps_rad = sorted({scale * gap_rad for scale in (1.0, motion_scale(views)) for gap_rad in GAPS_RAD})
+    coarse = [_shape(link, gap_rad, *contact) for contact in CONTACTS for gap_rad in gaps_rad]
     best = most_telling(views, coarse, regressors)
-    contact, gap_rad = CONTACTS[best // len(GAPS_RAD)], GAPS_RAD[best % len(GAPS_RAD)]
+    contact, gap_rad = CONTACTS[best // len(gaps_rad)], gaps_rad[best % len(gaps_rad)]
     return (*coarse, *(_shape(link, factor * gap_rad, *contact) for factor in CLOSER))
 
 
@@ -101,7 +110,7 @@ EFFECT = Effect(
         "P.-O. Gutman, 'Controlling mechanical systems with backlash - a survey', Automatica 38, 2002."
     ),
     parameters=(
-        Parameter("gap_rad", 0.0, 0.05, 1e-3, "whole play, joint side", off=0.0),
+        Parameter("gap_rad", 0.0, 1.0, 1e-3, "whole play, joint side", off=0.0),
         Parameter("contact_stiffness_nm_per_rad", *STIFFNESS_BOUNDS, 2e4, "stiffness of the closed contact"),
         Parameter(
             "contact_relaxation_s", 0.0, 0.02, 1e-3, "damping over stiffness of the closed contact", replayed=False

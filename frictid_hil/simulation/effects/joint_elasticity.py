@@ -23,7 +23,7 @@ def coupling_damping(
     return relaxation_s * coupling_nm_per_rad if compliance_rad_per_nm > 0.0 else coupling_nm_s_per_rad
 
 
-COMPLIANCE_BOUNDS = (1e-7, 0.2)  # from a large joint's stiff gear to a wrist of 0.01 kg m2 that swings at 4 Hz
+COMPLIANCE_BOUNDS = (1e-12, 1e4)  # from an axis in metres that carries tons to the motor of a hobby servo
 
 
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:

@@ -81,7 +81,7 @@ EFFECT = Effect(
     ),
     parameters=(
         Parameter("share", 0.0, 1.0, 0.15, "part of the friction level that builds up slowly", off=0.0),
-        Parameter("distance_rad", 2e-4, 0.1, 0.01, "travel over which it builds up"),
+        Parameter("distance_rad", 1e-6, 10.0, 0.01, "travel over which it builds up"),
         Parameter("loop_exponent", 0.5, 8.0, 1.0, "n: sharpness of the knee"),
         Parameter(
             "loop_beta", 0.0, 1.0, 1.0, "Bouc-Wen beta: 1 unloads as Dahl, 0.5 along a straight line", replayed=False
@@ -102,6 +102,7 @@ EFFECT = Effect(
             for n, b in ((1.0, 1.0), (1.0, 0.5), (2.0, 0.6))
         ),
         column,
+        of_motion="distance_rad",
     ),
     state_size=2,
 )

@@ -56,7 +56,7 @@ EFFECT = Effect(
     parameters=(
         Parameter("share", 0.0, 2.0, 0.3, "rise after a long rest, fraction of the Coulomb level", off=0.0),
         Parameter("dwell_time_s", 0.01, 30.0, 1.0, "time constant of the rise"),
-        Parameter("travel_rad", 1e-5, 0.1, 2e-3, "travel that wipes it out"),
+        Parameter("travel_rad", 1e-7, 10.0, 2e-3, "travel that wipes it out"),
     ),
     signature=Signature((Channel.PLANT,), (Region.STANDSTILL, Region.REVERSAL)),
     hooks=(Hook("level", level), Hook("remember", remember), Hook("settle", settle)),
@@ -66,6 +66,8 @@ EFFECT = Effect(
         "rise of break-away / Coulomb level",
         {"break-away": lambda dwell: p["share"] * (1.0 - np.exp(-dwell / p["dwell_time_s"]))},
     ),
-    inverse=shared(grid(dwell_time_s=(0.08, 0.25, 0.8, 2.5), travel_rad=(3e-4, 1e-3, 3e-3, 1e-2)), column),
+    inverse=shared(
+        grid(dwell_time_s=(0.08, 0.25, 0.8, 2.5), travel_rad=(3e-4, 1e-3, 3e-3, 1e-2)), column, of_motion="travel_rad"
+    ),
     state_size=1,
 )

@@ -46,7 +46,7 @@ EFFECT = Effect(
     ),
     parameters=(
         Parameter("share", -0.5, 2.0, 0.2, "rise of friction at standstill, fraction of the Coulomb level", off=0.0),
-        Parameter("stribeck_velocity_rad_s", 1e-3, 2.0, 0.05, "speed at which the rise has fallen to 1/e"),
+        Parameter("stribeck_velocity_rad_s", 1e-5, 100.0, 0.05, "speed at which the rise has fallen to 1/e"),
         Parameter("exponent", 0.5, 3.0, 2.0, "shape: 1 exponential, 2 Gaussian"),
     ),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
@@ -71,6 +71,7 @@ EFFECT = Effect(
     inverse=shared(
         grid(stribeck_velocity_rad_s=(0.008, 0.015, 0.025, 0.04, 0.06, 0.09, 0.13, 0.2), exponent=(1.0, 2.0)),
         column,
+        of_motion="stribeck_velocity_rad_s",
         of_speed=True,
     ),
 )
