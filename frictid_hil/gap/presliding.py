@@ -30,8 +30,8 @@ FURTHER = (
     "{was:.2g} rad"
 )
 TRAVEL = "no presliding stiffness is stated: friction builds up over {now:.2g} rad in these recordings"
-TRAVELS = (0.04, 0.2, 5.0, 25.0)
-"""Travels that are tried beside the usual one, over it, where none is stated: a ball bearing's to a soft gear's."""
+TRAVELS = (0.04, 0.2, 1.0, 5.0, 25.0)
+"""Travels that are tried where none is stated, over the usual one: a ball bearing's to a soft gear's."""
 CLOSER = (0.45, 0.67, 1.5, 2.2), (0.82, 1.22), (0.9, 1.1)  # the same over the best one so far
 SLOW_RAD_S = (0.01, 0.05)
 """Speeds over which friction may fall when sliding begins: what a Stribeck effect makes is not the form's."""
@@ -64,8 +64,9 @@ def as_it_yields(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]
 def _with_best_travel(experiments: ExperimentSet, logs: Sequence[Recording]) -> tuple[ExperimentSet, str | None]:
     """The set whose friction builds up over the travel that fits its recordings clearly best."""
     nominal = experiments.nominal
-    best, left = nominal, {nominal.presliding_travel_rad: _fit(logs, nominal)[0]}
-    for factors in (TRAVELS, *CLOSER):
+    scales = 1.0, motion_scale([v for log in logs if (v := log.view) is not None])
+    best, left = nominal, dict[float, float]()
+    for factors in ([scale * f for scale in scales for f in TRAVELS], *CLOSER):
         forms = [replace(best, presliding_travel_rad=f * best.presliding_travel_rad) for f in factors]
         left |= {form.presliding_travel_rad: _fit(logs, form)[0] for form in forms}
         best = replace(best, presliding_travel_rad=min(left, key=lambda travel_rad: left[travel_rad]))

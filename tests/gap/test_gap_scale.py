@@ -13,6 +13,7 @@ from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 
 MOTOR = pytest.param(30.0, 1e-3, id="a motor")
+FAST = pytest.param(200.0, 1e-4, id="a motor at 3000 revolutions a minute")
 AXIS = pytest.param(0.03, 100.0, id="an axis in metres")
 
 
@@ -77,7 +78,7 @@ def test_a_cause_is_found_in_any_unit(
     assert 0.5 * size < found.causes[0].parameters[number].value < 2.0 * size
 
 
-@pytest.mark.parametrize(("motion", "torque"), [pytest.param(1.0, 1.0, id="a joint"), MOTOR, AXIS])
+@pytest.mark.parametrize(("motion", "torque"), [pytest.param(1.0, 1.0, id="a joint"), MOTOR, FAST, AXIS])
 def test_a_healthy_joint_needs_no_stated_stiffness_in_any_unit(motion: float, torque: float) -> None:
     """The travel over which friction builds up is read from the recordings, finely enough that it makes no gap."""
     healthy = recorded(motion, torque, {})
