@@ -197,7 +197,8 @@ def _left_out(check: Mapping[str, Any]) -> list[str]:
         f"{_percent(LEFT_OUT_AIM)} at most: "
         f"{_percent(wrong['rate'])} ({_count(wrong)}, {_interval(wrong)}); "
         f"a confident partner of the true one (an honest one is named below 0.9): {_count(partner)}, "
-        f"{_interval(partner)}; the two together: {_percent(both)}. Answered `unknown`: "
+        f"{_interval(partner)}; the two together: {_percent(both)}. Named all the same, as an error of a "
+        f"belief can be: {_count(check['named_all_the_same'])}. Answered `unknown`: "
         f"{_percent(check['answered_unknown']['rate'])}.",
         "",
         *(table if check["wrong_causes"] else ["No cause was named with confidence."]),

@@ -190,17 +190,22 @@ def _singles(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any
 
 
 def score_left_out(answers: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
-    """The second check: visible joints with one effect, each taken out of the library before it was diagnosed."""
+    """The second check: visible joints with one effect, each taken out of the library before it was diagnosed.
+
+    An error of a belief can be named all the same, and rightly: what is believed of the number stays.
+    """
 
     def partner(truth: Mapping[str, Any], answer: Answer) -> bool:
         return {_name(truth), answer.first} in [set(pair) for pair in PARTNERS]
 
-    confident = [(t, a) for t, a in answers if a.confidence >= CONFIDENT]
+    confident = [(t, a) for t, a in answers if a.confidence >= CONFIDENT and a.first != _name(t)]
+    partners = [(t, a) for t, a in confident if partner(t, a)]
     return {
         "joints": len(answers),
         "errors": [{"case": t["case"], "message": a.message} for t, a in answers if a.verdict == "error"],
-        "confident_wrong": counted(a.confidence >= CONFIDENT and not partner(t, a) for t, a in answers),
-        "confident_partner": counted(a.confidence >= CONFIDENT and partner(t, a) for t, a in answers),
+        "confident_wrong": Rate(len(confident) - len(partners), len(answers)).to_json(),
+        "confident_partner": Rate(len(partners), len(answers)).to_json(),
+        "named_all_the_same": counted(a.first == _name(t) for t, a in answers),
         "answered_unknown": counted(a.verdict == "unknown" for _, a in answers),
         "wrong_causes": [
             {

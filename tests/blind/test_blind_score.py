@@ -187,10 +187,13 @@ def test_with_its_effect_left_out_only_a_confident_stranger_is_wrong() -> None:
             (delayed, answer("explained", ("electrical_lag", 0.95))),
             (delayed, answer("explained", ("stribeck", 0.95))),
             (delayed, answer("explained", ("stribeck", 0.5))),
+            (truth("b", "single", "gravity_error"), answer("explained", ("gravity_error", 0.95))),
         ]
     )
-    assert counts(s["confident_wrong"]) == (1, 5)
-    assert counts(s["confident_partner"]) == (1, 5)
+    assert counts(s["confident_wrong"]) == (1, 6)
+    assert counts(s["confident_partner"]) == (1, 6)
+    assert counts(s["named_all_the_same"]) == (1, 6)
+    assert [cause["named"] for cause in s["wrong_causes"]] == ["electrical_lag", "stribeck"]
     assert s["by_effect"]["torque_delay"] == {"electrical_lag": 2, "stribeck": 2, "unknown": 1}
 
 
