@@ -112,5 +112,4 @@ def _table(there: Controller, stated: Controller, raw: Experiment, exact: Experi
     gains = demand_parts(there, e, step_s, [0.0] * len(GAINS))
     columns = np.column_stack([held(np.column_stack([gains, late, np.ones_like(demand)])), left])
     low_pass = LowPass.at(1.0 / step_s, e.band_hz)
-    rows: Array = low_pass(columns)[5 : -5 : low_pass.stride]
-    return rows
+    return np.asarray(low_pass(columns)[5 : -5 : low_pass.stride])

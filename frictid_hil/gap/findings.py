@@ -145,8 +145,7 @@ def _products(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> Array:
     columns, values = joined(parts)
     starts = np.cumsum([0, *(own.size for _, own in parts[:-1])])
     each = values[:, None] * gram[np.ix_(columns, columns)] * values
-    products: Array = np.add.reduceat(np.add.reduceat(each, starts, axis=0), starts, axis=1)
-    return products
+    return np.asarray(np.add.reduceat(np.add.reduceat(each, starts, axis=0), starts, axis=1))
 
 
 def _size(inner: Array) -> float:
@@ -359,8 +358,7 @@ def _lent(effect: str, channels: Sequence[Sampled]) -> Array:
     size, blur = (rms(_over_channels(what, effect, channels)) for what in ("sizes", "blurs"))
     spread = math.hypot(form_of(effect), blur / max(size, FORM * VISIBLE))
     normal = special.ndtri((np.arange(DRAWS) + 0.5) / DRAWS)
-    factors: Array = 1.0 + spread * np.random.default_rng(0).permutation(normal)
-    return factors
+    return np.asarray(1.0 + spread * np.random.default_rng(0).permutation(normal))
 
 
 def whole_draws(

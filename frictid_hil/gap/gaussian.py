@@ -18,8 +18,7 @@ def log_between(low: Array, high: Array) -> Array:
     swap = low > 0.0
     low, high = np.where(swap, -high, low), np.where(swap, -low, high)
     top, rest = special.log_ndtr(high), special.log_ndtr(low)
-    difference: Array = top + np.log1p(-np.exp(np.minimum(rest - top, -1e-12)))
-    return difference
+    return np.asarray(top + np.log1p(-np.exp(np.minimum(rest - top, -1e-12))))
 
 
 def put_inside(values: Array, root: Array, starts: np.ndarray, low: Array, high: Array) -> Array:

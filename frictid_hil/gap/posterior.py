@@ -151,8 +151,7 @@ class Posterior:
     def _spread(self, gram: Array) -> Array:
         """Gram matrix of the tables over the scaled columns of all terms, the residual last, (terms + 1, terms + 1)."""
         at, scale = np.append(self._place, gram.shape[0] - 1), np.append(self._scale, 1.0)
-        spread: Array = gram[np.ix_(at, at)] * scale[:, None] * scale
-        return spread
+        return np.asarray(gram[np.ix_(at, at)] * scale[:, None] * scale)
 
     def _reduce(self) -> None:
         """Integrate the nuisances out, at every point of the grid."""
@@ -235,8 +234,7 @@ class Posterior:
         held = log_between((self._low[own] - mean) / spread, (self._high[own] - mean) / spread)
         again = len(terms) - len({self.channel.candidates[t].effect for t in terms})
         constant = float(np.sum(self._log_prior[list(terms)]) - np.sum(self._before[own])) - again * self._log_chance
-        added: Array = gains + np.sum(held, axis=1) + constant
-        return added
+        return np.asarray(gains + np.sum(held, axis=1) + constant)
 
     def _extended(self, terms: Sequence[int], g: int) -> Array:
         """What each candidate would add to a set at one point of the grid, shape (candidates,)."""

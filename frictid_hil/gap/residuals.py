@@ -38,6 +38,9 @@ from frictid_hil.simulation.joint import Payload
 
 CUTOFF_HZ = 20.0  # low-pass of everything that is compared (zero phase, fourth order); lower where the sampling is slow
 
+TICKS = 8  # points to a row along which friction turns with the joint
+LEAST_STEPS = 0.2  # step of a position over the way within which friction builds up, up to which it may be interpolated
+ROUNDED_RAD = 1e-12  # what rounding of a computer leaves
 LATE = (0.5, 0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0)
 """How late a row's torque may be, in rows; the mean over the row comes first."""
 LEAST_SHARE = 0.01  # change of a gain by which its part of the demand is formed, at least
@@ -164,8 +167,7 @@ def _late_of_row(experiments: ExperimentSet) -> float | None:
         view = view_of(nominal, e, step_s, 0.0, 0.0)
         low_pass = LowPass.at(1.0 / step_s, e.band_hz)
         parts = [view.acceleration_rad_s2, view.slip, view.velocity_rad_s, np.cos(e.position_rad)]
-        rigid = e.rigid_body_torque_nm
-        model = np.stack([*parts, np.ones_like(view.slip), *([] if rigid is None else [rigid])], axis=1)
+        model = np.stack([*parts, np.ones_like(view.slip)], axis=1)
         model = low_pass(reported(model, nominal.torque_report_filter, step_s))[5:-5]
         torque = low_pass(np.stack([aligned(view.torque_nm, late) for late in LATE], axis=1))[5:-5]
         weights = np.linalg.lstsq(model, torque, rcond=None)[0]
@@ -300,12 +302,21 @@ def friction_scales(nominal: Nominal) -> tuple[float, float]:
 def presliding_state(nominal: Nominal, position_rad: Array, stiffer: float = 1.0) -> Array:
     """State of the believed friction along a measured position, -1..1, from a relaxed start, shape (n,).
 
-    ``stiffer`` is a factor of its stiffness.
+    ``stiffer`` is a factor of its stiffness. A joint turns back between two rows: how far it went is interpolated,
+    unless the steps of an encoder are longer than the way over which friction builds up.
     """
     coulomb, stiffness = friction_scales(nominal)
     slip_per_rad = stiffer * stiffness / coulomb
-    gradual = nominal.yields_gradually
-    return np.asarray(bent(position_rad, 1.0 / slip_per_rad) if gradual else slip_state(position_rad, slip_per_rad))
+    ticks = TICKS if least_step_rad(position_rad) < LEAST_STEPS / slip_per_rad else 1
+    along = between(position_rad, ticks)
+    state = bent(along, 1.0 / slip_per_rad) if nominal.yields_gradually else slip_state(along, slip_per_rad)
+    return np.asarray(state[::ticks])
+
+
+def least_step_rad(position_rad: Array) -> float:
+    """The smallest step between two positions of a log: of its encoder, or of the digits it was written with."""
+    steps = np.diff(np.sort(position_rad))
+    return float(np.min(steps, where=steps > ROUNDED_RAD, initial=np.inf))
 
 
 def nominal_torque(nominal: Nominal, experiment: Experiment, view: View) -> Array:

@@ -298,8 +298,7 @@ def _rigid_columns(e: Experiment, nominal: Nominal, given: bool) -> Array:
         known = nominal.inertia_kg_m2 * acceleration + nominal.gravity_cos_nm * np.cos(q)
         torque = torque - known - nominal.gravity_sin_nm * np.sin(q)
         columns[:, :3] = 0.0
-    table: Array = low_pass(np.concatenate([columns, torque[:, None]], axis=1))[:: low_pass.stride]
-    return table
+    return np.asarray(low_pass(np.concatenate([columns, torque[:, None]], axis=1))[:: low_pass.stride])
 
 
 def one_sided(experiments: ExperimentSet) -> str | None:

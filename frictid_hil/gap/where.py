@@ -246,8 +246,7 @@ class _Explained:
     def fitted(self, names: Sequence[Region]) -> Array:
         """What the families together say, shape (m,)."""
         at = np.concatenate([self._at[name] for name in names])
-        fitted: Array = self._table[:, at] @ self._weights(at)
-        return fitted
+        return np.asarray(self._table[:, at] @ self._weights(at))
 
     def shares(self) -> dict[Region, float]:
         """Shapley's share of the explained squares, by family; they add up to what all explain together."""
@@ -271,16 +270,14 @@ class _Explained:
 
     def _weights(self, at: np.ndarray) -> Array:
         inner = self._gram[np.ix_(at, at)] + 1e-6 * np.eye(at.size)
-        weights: Array = np.linalg.solve(inner, self._right[at])
-        return weights
+        return np.asarray(np.linalg.solve(inner, self._right[at]))
 
 
 def _above(values: Array, rate_hz: float) -> Array:
     """The part above ``FAST_HZ``, by its spectrum: orthogonal to the rest, so that squares add up."""
     spectrum = np.fft.rfft(values)
     spectrum[np.fft.rfftfreq(values.size, 1.0 / rate_hz) < FAST_HZ] = 0.0
-    above: Array = np.fft.irfft(spectrum, values.size)
-    return above
+    return np.asarray(np.fft.irfft(spectrum, values.size))
 
 
 def _after_reversal(position_rad: Array, slip: Array, travel_rad: float) -> np.ndarray:

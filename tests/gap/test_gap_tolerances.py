@@ -17,11 +17,21 @@ from frictid_hil.errors import ConfigError, InputFileError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Builder, taken
-from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet
+from frictid_hil.gap.diagnose import diagnose
+from frictid_hil.gap.experiment_set import LOG_COLUMNS, Controller, Experiment, ExperimentSet
 from frictid_hil.gap.forward import nominal_model
 from frictid_hil.gap.nuisances import bent_rate_nm, nuisances
 from frictid_hil.gap.posterior import FORM
-from frictid_hil.gap.residuals import controller_demand, demand_of, demand_parts, recordings
+from frictid_hil.gap.residuals import (
+    controller_demand,
+    demand_of,
+    demand_parts,
+    friction_scales,
+    presliding_state,
+    recordings,
+    rms,
+    slip_state,
+)
 from frictid_hil.gap.sanity import checked
 from frictid_hil.gap.tolerances import RELATIVE_BY_KIND, Tolerances, stated_by
 from frictid_hil.simulation.replay import Controller as Loop
@@ -218,6 +228,41 @@ def test_what_depends_on_speed_begins_where_the_curve_does() -> None:
     assert not np.allclose(r.view.rate_nm[measured], expected, atol=0.1)
     straight = replace(nominal, curve=FrictionCurve.through(speeds, 2.6 + 1.6 * speeds))
     assert bent_rate_nm(straight, [r.view]) == []
+
+
+def test_friction_turns_where_a_joint_turns_between_two_rows() -> None:
+    """20 ms rows of a motion whose friction builds up within 4 ms: the rows alone do not tell when it turned."""
+    fine_s = np.arange(0.0, 6.0, 2e-4)
+    fine, rows = 0.05 * np.sin(6.0 * fine_s) + 0.03 * np.sin(17.0 * fine_s), slice(None, None, 100)
+    _, stiffness = friction_scales(gap_sets.NOMINAL)
+    slip_per_rad = stiffness / friction_scales(gap_sets.NOMINAL)[0]
+    true = slip_state(fine, slip_per_rad)[rows]
+    told, plain = presliding_state(gap_sets.NOMINAL, fine[rows]), slip_state(fine[rows], slip_per_rad)
+    assert rms(told - true) < 0.4 * rms(plain - true)
+    # Between the steps of a coarse encoder nothing is made up.
+    stepped = 1e-3 * np.round(fine[rows] / 1e-3)
+    assert np.array_equal(presliding_state(gap_sets.NOMINAL, stepped), slip_state(stepped, slip_per_rad))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("effect", "first"),
+    [({}, "none"), ({"gravity_error": {"error_share": 0.12}}, "gravity_error")],
+)
+def test_a_log_of_50_hz_makes_no_rigid_joint_elastic(effect: dict[str, dict[str, float]], first: str) -> None:
+    made = gap_sets.make(effect)
+
+    def thinned(e: Experiment) -> Experiment:
+        columns = {name: column[::10] for name in LOG_COLUMNS if (column := getattr(e, name)) is not None}
+        return replace(e, **columns)
+
+    slow = replace(
+        made,
+        nominal=replace(made.nominal, controller=None),
+        experiments=tuple(thinned(e) for e in made.experiments),
+    )
+    found = diagnose(slow)
+    assert (found.causes[0].effect if found.causes else found.verdict) == first
 
 
 def test_nobody_knows_friction_below_a_first_pair_that_is_passed_in_reversals_alone() -> None:
