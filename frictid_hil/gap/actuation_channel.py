@@ -15,16 +15,7 @@ from frictid_hil.gap.drive_replay import DriveReplay, forms, with_one
 from frictid_hil.gap.experiment_set import Controller, Nominal, with_gains
 from frictid_hil.gap.gain_errors import gain_errors
 from frictid_hil.gap.plant_channel import BEYOND, families_of, white_nm, without_nuisances
-from frictid_hil.gap.residuals import (
-    LowPass,
-    Recording,
-    demand_of,
-    demand_parts,
-    held,
-    reported,
-    rms,
-    settled,
-)
+from frictid_hil.gap.residuals import LowPass, Recording, demand_of, demand_parts, held, reported, rms, settled
 from frictid_hil.simulation.drive_form import ActuationForm, DriveView
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse_loops import lagged

@@ -116,7 +116,7 @@ def _along(nominal: Nominal, position_rad: Array, payload: bool, log: Recording)
     """What inverse forms see of the believed joint along a motion that it follows exactly."""
     time_s = log.step_s * np.arange(position_rad.size)
     bare = Experiment("next", False, payload, 0, time_s, position_rad, torque_nm=np.zeros(position_rad.size))
-    view = view_of(nominal, bare, log.step_s, 0.0, 0.0)
+    view = view_of(nominal, bare, log.step_s, 0.0)
     return replace(view, torque_nm=nominal_torque(nominal, bare, view))
 
 

@@ -9,16 +9,7 @@ from frictid_hil.gap.experiment_set import Nominal
 from frictid_hil.gap.findings import EVEN, Finding, Sampled, told_numbers
 from frictid_hil.gap.forward import Simulation, pooled
 from frictid_hil.gap.how_far import Closed
-from frictid_hil.gap.verdict import (
-    AS_STATED,
-    FLOORS,
-    FLOORS_AS_STATED,
-    SHOWS,
-    STANDS_OUT,
-    as_stated,
-    expected,
-    needed,
-)
+from frictid_hil.gap.verdict import AS_STATED, FLOORS, FLOORS_AS_STATED, SHOWS, STANDS_OUT, as_stated, expected, needed
 
 NEGLIGIBLE = 0.05
 """Gap that means nothing in practice, over the friction level: friction repeats to about this from day to day."""

@@ -38,6 +38,7 @@ from frictid_hil.simulation.joint import Payload
 
 CUTOFF_HZ = 20.0  # low-pass of everything that is compared (zero phase, fourth order); lower where the sampling is slow
 
+BRIEF = 0.4  # part of a row below which a torque that is applied for it is brief
 TICKS = 8  # points to a row along which friction turns with the joint
 LEAST_STEPS = 0.2  # step of a position over the way within which friction builds up, up to which it may be interpolated
 ROUNDED_RAD = 1e-12  # what rounding of a computer leaves
@@ -142,15 +143,15 @@ def rms(values: Array) -> float:
 
 def recordings(experiments: ExperimentSet) -> tuple[Recording, ...]:
     """All experiments of a set with their residuals, in run order."""
-    late = _late_of_row(experiments)
+    timing = _timing_of_row(experiments)
     lengths_s = [float(e.time_s[-1] - e.time_s[0]) for e in experiments.experiments]
     starts_s = itertools.accumulate(lengths_s, initial=0.0)
     logs = zip(experiments.experiments, starts_s, strict=False)
-    return tuple(_recording(experiments.nominal, e, start_s, late) for e, start_s in logs)
+    return tuple(_recording(experiments.nominal, e, start_s, timing) for e, start_s in logs)
 
 
-def _late_of_row(experiments: ExperimentSet) -> float | None:
-    """How late a row's torque is, in rows, where no controller tells: as the motion fits best; None where one does.
+def _timing_of_row(experiments: ExperimentSet) -> tuple[float, bool] | None:
+    """How late a row's torque is and whether it is brief, see ``aligned``, as fits best; None where a controller tells.
 
     A rigid-body column was made for the torque of its own row.
     """
@@ -158,27 +159,36 @@ def _late_of_row(experiments: ExperimentSet) -> float | None:
     if nominal.controller is not None:
         return None
     if any(e.rigid_body_torque_nm is not None for e in experiments.experiments):
-        return 0.0
-    left = np.zeros(len(LATE))
+        return 0.0, False
+    left = np.zeros(2 * len(LATE))
     for raw in experiments.experiments:
         if raw.torque_nm is None:
             continue
         e, step_s, _ = uniform(raw)
-        view = view_of(nominal, e, step_s, 0.0, 0.0)
+        view = view_of(nominal, e, step_s, 0.0)
+        assert e.torque_nm is not None
         low_pass = LowPass.at(1.0 / step_s, e.band_hz)
         parts = [view.acceleration_rad_s2, view.slip, view.velocity_rad_s, np.cos(e.position_rad)]
         model = np.stack([*parts, np.ones_like(view.slip)], axis=1)
         model = low_pass(reported(model, nominal.torque_report_filter, step_s))[5:-5]
-        torque = low_pass(np.stack([aligned(view.torque_nm, late) for late in LATE], axis=1))[5:-5]
+        ways = [aligned(e.torque_nm, late, brief=brief) for brief in (False, True) for late in LATE]
+        torque = low_pass(np.stack(ways, axis=1))[5:-5]
         weights = np.linalg.lstsq(model, torque, rcond=None)[0]
         left += np.sum((torque - model @ weights) ** 2, axis=0)
-    return LATE[int(np.argmin(left))]
+    brief, best = divmod(int(np.argmin(left)), len(LATE))
+    return LATE[best], bool(brief)
 
 
-def aligned(torque_nm: Array, late: float) -> Array:
-    """Torque at each row where a row's report is late by so many rows, shape unchanged."""
+def aligned(torque_nm: Array, late: float, *, brief: bool) -> Array:
+    """Torque about each row as the second difference of a position has it, shape unchanged.
+
+    That difference is the mean of the acceleration between the rows on either side, its weights a triangle. A report is
+    ``late`` by so many rows, and the torque held from row to row, or ``brief``: then it is known at the rows alone.
+    """
     torque = torque_nm.copy()
     torque[:-1] = (1.0 - late) * torque_nm[:-1] + late * torque_nm[1:]
+    if brief:
+        torque[1:-1] += np.diff(torque, 2) / 6.0
     return torque
 
 
@@ -193,7 +203,7 @@ def reported(columns: Array, report: ReportFilter | None, step_s: float) -> Arra
     return columns
 
 
-def _recording(nominal: Nominal, raw: Experiment, start_s: float, late: float | None) -> Recording:
+def _recording(nominal: Nominal, raw: Experiment, start_s: float, timing: tuple[float, bool] | None) -> Recording:
     experiment, step_s, resampled = uniform(raw)
     q = experiment.position_rad
     view = demand = actuation = kinematic = plant = None
@@ -202,7 +212,7 @@ def _recording(nominal: Nominal, raw: Experiment, start_s: float, late: float | 
     elif nominal.controller is not None and experiment.position_command_rad is not None:
         demand = demand_of(nominal.controller, experiment, step_s)
     if experiment.torque_nm is not None:
-        view = view_of(nominal, experiment, step_s, start_s, late)
+        view = view_of(nominal, experiment, step_s, start_s, timing)
         plant = view.torque_nm - nominal_torque(nominal, experiment, view)
         # The ends have no second difference.
         plant[0], plant[-1] = plant[1], plant[-2]
@@ -235,19 +245,18 @@ def view_of(
     experiment: Experiment,  # on a uniform clock
     step_s: float,  # of that clock
     start_s: float,  # of the experiment in its session
-    # How late a row's torque is, in rows; half of the time that it has been applied unless given.
-    late: float | None = None,
+    timing: tuple[float, bool] | None = None,  # as of ``aligned``; as the controller tells unless given
 ) -> View:
     """What inverse forms see of one experiment."""
     q = experiment.position_rad
     assert experiment.torque_nm is not None
     acceleration = np.zeros_like(q)
     acceleration[1:-1] = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / step_s**2
-    if late is None:
+    if timing is None:
         # A log that keeps every fifth tick of its controller keeps that tick's torque, applied since then.
-        applied_s = step_s if nominal.controller is None else min(step_s, 1.0 / nominal.controller.rate_hz)
-        late = 0.5 * applied_s / step_s
-    torque = aligned(experiment.torque_nm, late)
+        applied = 1.0 if nominal.controller is None else min(1.0, 1.0 / (nominal.controller.rate_hz * step_s))
+        timing = 0.5 * applied, applied < BRIEF
+    torque = aligned(experiment.torque_nm, timing[0], brief=timing[1])
     inertia = nominal.inertia_kg_m2 or 0.0
     motor = inertia * (nominal.motor_inertia_share or 0.0)
     payload = (nominal.payload if experiment.payload else None) or Payload(0.0, 0.0)
@@ -302,15 +311,17 @@ def friction_scales(nominal: Nominal) -> tuple[float, float]:
 def presliding_state(nominal: Nominal, position_rad: Array, stiffer: float = 1.0) -> Array:
     """State of the believed friction along a measured position, -1..1, from a relaxed start, shape (n,).
 
-    ``stiffer`` is a factor of its stiffness. A joint turns back between two rows: how far it went is interpolated,
-    unless the steps of an encoder are longer than the way over which friction builds up.
+    ``stiffer`` is a factor of its stiffness. A joint turns back between two rows: how far it went is interpolated, and
+    the state is the mean about each row that ``aligned`` speaks of, unless the steps of an encoder are longer than the
+    way over which friction builds up.
     """
     coulomb, stiffness = friction_scales(nominal)
     slip_per_rad = stiffer * stiffness / coulomb
     ticks = TICKS if least_step_rad(position_rad) < LEAST_STEPS / slip_per_rad else 1
     along = between(position_rad, ticks)
     state = bent(along, 1.0 / slip_per_rad) if nominal.yields_gradually else slip_state(along, slip_per_rad)
-    return np.asarray(state[::ticks])
+    triangle = np.bartlett(2 * ticks + 1)[1:-1] / ticks
+    return np.asarray(np.convolve(np.pad(state, ticks - 1, mode="edge"), triangle, mode="valid")[::ticks])
 
 
 def least_step_rad(position_rad: Array) -> float:
