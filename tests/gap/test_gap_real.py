@@ -39,9 +39,9 @@ def loaded(name: str) -> ModuleType:
 @pytest.mark.parametrize("judge_pulses", [True, False])
 def test_the_linear_axis_keeps_an_open_gap_that_nobody_clears(benchmark: ModuleType, judge_pulses: bool) -> None:
     found = diagnose(benchmark.emps(REAL, judge_pulses))
-    # No single effect closes a sixth of it on the other recording; asymmetry helps on both.
+    # Asymmetry helps on both recordings, and nothing that has a name closes the gap.
     assert found.verdict == "unknown" and "cause" in found.reasons
-    assert found.held_out["direction_asymmetry"] < -5.0
+    assert found.held_out["direction_asymmetry"] < -4.0
     assert found.before.forward_torque_nm is None and "controller" in found.reasons["forward_torque_nm"]
 
 
