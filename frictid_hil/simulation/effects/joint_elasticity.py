@@ -82,7 +82,7 @@ EFFECT = Effect(
         Parameter("compliance_rad_per_nm", 0.0, COMPLIANCE_BOUNDS[1], 1e-4, "twist per torque; 0 is rigid", off=0.0),
         Parameter("relaxation_s", 0.0, 0.02, 3e-4, "damping over stiffness"),
     ),
-    signature=Signature((Channel.PLANT,), (Region.FREQUENCY, Region.ACCELERATION)),
+    signature=Signature((Channel.PLANT,), (Region.FREQUENCY, Region.ACCELERATION, Region.REVERSAL)),
     hooks=(Hook("coupling", coupling), Hook("coupling_damping", coupling_damping)),
     illustrate=_illustrate,
     inverse=through_transmission("compliance_rad_per_nm", SHAPES, shapes_for, regressors),
