@@ -107,6 +107,7 @@ TABLES: tuple[tuple[ModuleType, str], ...] = (
     (smoothing, "CLIFF_DB"), (smoothing, "SILENT_DB"), (smoothing, "BELOW_DB"), (smoothing, "OWN_DB"),
     (smoothing, "LEAST_HZ"), (smoothing, "MOST_HZ"), (smoothing, "KEPT"), (smoothing, "PART_S"),
     (plant_channel, "SEVERAL"), (nuisances, "ANYWHERE"), (nuisances, "REVERSING"),
+    (residuals, "TICKS"), (residuals, "LEAST_STEPS"), (residuals, "BRIEF"),
     (tick_timing, "CLEARLY"), (position_noise, "NOISE_SHARE"), (tracking_channel, "SPREAD"),
 )  # fmt: skip
 """The tables of the channels."""

@@ -212,8 +212,10 @@ def test_a_level_is_taken_for_what_is_told_first(benchmark_named: Callable[[str]
     level = benchmark_named("gap_level")
     (tmp_path / "truth").mkdir()
     for name, kind in (("case_000", "none"), ("case_001", "single")):
-        (tmp_path / "truth" / f"{name}.yaml").write_text(yaml.safe_dump({"case": name, "kind": kind}))
-    assert level.healthy(tmp_path) == [tmp_path / "cases" / "case_000"]
+        truth = {"case": name, "kind": kind, "present": ["inertia_error"], "neutral": ["stribeck"]}
+        (tmp_path / "truth" / f"{name}.yaml").write_text(yaml.safe_dump(truth))
+    asked, there = level.healthy(tmp_path), frozenset({"inertia_error", "stribeck"})
+    assert asked == [level.Asked(tmp_path / "cases" / "case_000", off, there) for off in level.OFF]
 
     def answer(verdict: str, *causes: tuple[str, float]) -> SimpleNamespace:
         return SimpleNamespace(verdict=verdict, causes=[SimpleNamespace(effect=n, confidence=c) for n, c in causes])
